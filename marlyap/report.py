@@ -1,0 +1,893 @@
+"""One self-contained HTML page that says how good a team is and shows it moving.
+
+`html` is a pure function from plain data to text: no JAX, no network, no files but its own
+template, `report_page.html`, which holds the style and the film player. Everything that a user may
+have written is escaped, the page's security policy allows only the template's own script, and what
+is missing or not a number is shown as a dash.
+
+The data is described by the typed dictionaries below. Only `title` is required, and `positions` of
+a film; every other key may be absent, and numbers may be Python's, NumPy's, NaN or None.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from html import escape
+from importlib.resources import files
+from typing import Any, Literal, NotRequired, Required, TypedDict
+
+import numpy as np
+
+# -------------------------------------------------------------------------------------------------
+# The data
+# -------------------------------------------------------------------------------------------------
+
+
+class Summary(TypedDict, total=False):
+    """The verdict: the large figure at the top."""
+
+    success_rate: float
+    interval: Sequence[float]  # exact 95 % interval, low and high
+    episodes: int
+    successes: int
+    seeds: int  # number of training seeds
+    radius: float  # m, of success
+    text: str  # one plain sentence: what is certified and what is not
+
+
+class Within(TypedDict, total=False):
+    """Success at one radius."""
+
+    radius: float  # m
+    successes: int
+    rate: float
+    interval: Sequence[float]
+
+
+# One line of the training log: environment steps so far, success rate, mean return of an episode.
+# Other keys are ignored.
+LogRow = TypedDict("LogRow", {"steps": int, "success": float, "return": float}, total=False)
+
+
+class Run(TypedDict, total=False):
+    """One trained run (one seed) and its evaluation."""
+
+    name: str
+    label: str
+    algorithm: str
+    seed: int
+    episodes: int
+    successes: int
+    success_rate: float
+    interval: Sequence[float]
+    radii: Sequence[Within]
+    final_distance: Mapping[str, float]  # m, by quantile: "0.5", "0.95", "1.0"
+    settling_time: Mapping[str, float]  # s, by quantile
+    return_mean: float  # of an episode
+    log: Sequence[LogRow]
+
+
+class Film(TypedDict, total=False):
+    """One episode. All lists over time have the same length, the first entry being the start."""
+
+    positions: Required[Any]  # [time][agent][2], m
+    label: str  # "best", "median", "worst", ...
+    start: int  # number of the start among those evaluated
+    run: str
+    dt: float  # s
+    radius: float  # m
+    target: Any  # [x, y], or one per agent, or None
+    headings: Any  # [time][agent], rad, or None for point masses
+    leaders: Sequence[bool]
+    edges: Any  # [[i, j], ...] when constant, else [time][[i, j], ...]
+    distance: Any  # [time], m: of the worst agent; computed from the target when absent
+    lyapunov: Any  # [time] or None
+    cost: Any  # [time]; shown where there is no lyapunov
+    success: bool
+
+
+class Comparison(TypedDict, total=False):
+    """Two runs on the same starts: McNemar's test on the starts that only one of them mastered."""
+
+    a: str
+    b: str
+    only_a: int
+    only_b: int
+    p_value: float
+    text: str
+
+
+class Certificate(TypedDict, total=False):
+    """One claim, and what stands behind it."""
+
+    claim: str
+    evidence: str
+    bound: float | str
+    confidence: float | str
+    text: str
+
+
+class Page(TypedDict):
+    """All that a report shows."""
+
+    title: str
+    subtitle: NotRequired[str]  # task and algorithm in words
+    generated: NotRequired[str]  # date
+    summary: NotRequired[Summary]
+    runs: NotRequired[Sequence[Run]]
+    pooled: NotRequired[
+        Sequence[Run]
+    ]  # rows over several seeds; one is made from the summary when absent
+    films: NotRequired[Sequence[Film]]
+    comparisons: NotRequired[Sequence[Comparison]]
+    certificates: NotRequired[Sequence[Certificate]]
+    config: NotRequired[Mapping[str, Any]]
+    versions: NotRequired[Mapping[str, str]]
+    command: NotRequired[str]
+    wall_time_s: NotRequired[float]
+
+
+# -------------------------------------------------------------------------------------------------
+# The page
+# -------------------------------------------------------------------------------------------------
+
+# The colours of Okabe and Ito, one per agent or run; one is kept for what should not happen.
+PALETTE = ("#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a7d85")
+ALARM = "#d55e00"
+DASH = "–"
+
+
+def html(page: Page) -> str:
+    """The whole report as the text of one HTML file."""
+    template = files("marlyap").joinpath("report_page.html").read_text(encoding="utf-8")
+    script = re.search(r"<script>(.*?)</script>", template, re.DOTALL)
+    assert script is not None, "report_page.html holds one script"
+    shown = scenes(page.get("films") or ())
+    parts = {
+        "policy": _policy(script[1]),
+        "title": _text(page["title"]),
+        "header": _header(page),
+        "player": _episodes(shown),
+        "runs": _runs(page),
+        "curves": _curves(page.get("runs") or ()),
+        "starts": _starts(shown),
+        "comparisons": _comparisons(page.get("comparisons") or ()),
+        "certificates": _certificates(page.get("certificates") or ()),
+        "making": _making(page),
+        "films": _json([_film(scene) for scene in shown]),
+    }
+    return re.sub(r"<!--#(\w+)-->", lambda mark: parts[mark[1]], template)
+
+
+def _policy(script: str) -> str:
+    """A content security policy: nothing from anywhere, and no script but this one."""
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    nothing = "default-src 'none'; base-uri 'none'; form-action 'none'"
+    return f"{nothing}; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
+
+
+def _header(page: Page) -> str:
+    kicker = f"marlyap report · {_text(page.get('generated'))}".removesuffix(f" · {DASH}")
+    head = _tag("p", kicker, cls="kicker") + _tag("h1", _text(page["title"]))
+    if page.get("subtitle"):
+        head += _tag("p", _text(page.get("subtitle")), cls="lede")
+    return head + _verdict(page.get("summary") or {})
+
+
+def _verdict(summary: Summary) -> str:
+    rate, interval = _number(summary.get("success_rate")), summary.get("interval")
+    note = _tag("p", _text(summary.get("text")), cls="caveat") if summary.get("text") else ""
+    if rate is None:
+        return note
+    seeds, radius = _number(summary.get("seeds")), _number(summary.get("radius"))
+    count = _tag("strong", _integer(summary.get("successes")))
+    facts = [f"{count} of {_integer(summary.get('episodes'))} episodes succeeded"]
+    if radius is not None:
+        facts.append(f"success within {radius:g} m")
+    if seeds is not None:
+        facts.append(f"{seeds:.0f} training seed{'' if seeds == 1 else 's'}")
+    side = _tag("p", "; ".join(facts)) + _gauge(rate, interval)
+    side += _tag("p", f"exact 95 % interval {_interval(interval)}")
+    figure = _tag("p", _percent(rate), cls="figure")
+    return _tag("div", figure + _tag("div", side), cls="verdict") + note
+
+
+def _gauge(rate: float, interval: Any) -> str:
+    """A line from 0 to 100 % with the interval as a bar and the rate as a tick."""
+    low, high = _pair(interval) or (rate, rate)
+    width = 300 * max(high - low, 0.004)
+    marks = (
+        _tag("line", cls="axis", x1=0, x2=300, y1=7, y2=7)
+        + _tag("rect", cls="band", x=300 * low, y=3, width=width, height=8, rx=1.5)
+        + _tag("line", cls="tick", x1=300 * rate, x2=300 * rate, y1=0, y2=14)
+        + _tag("text", "0", x=0, y=26)
+        + _tag("text", "100 %", x=300, y=26, text_anchor="end")
+    )
+    return _svg(300, 28, marks, "success rate and interval from 0 to 100 %", "gauge")
+
+
+# -------------------------------------------------------------------------------------------------
+# Tables
+# -------------------------------------------------------------------------------------------------
+
+
+def _runs(page: Page) -> str:
+    runs = page.get("runs") or ()
+    if not runs:
+        return ""
+    radii = sorted({radius for run in runs for radius, *_ in _within(run)})
+    head = ["Run", "Success", "95 % interval", *[f"within {radius:g} m" for radius in radii]]
+    head += ["Final distance (m)", "Settling time (s)", "Return"]
+    body = [_run_row(run, radii, c) for run, c in zip(runs, _colours(runs), strict=True)]
+    body += [_run_row(run, radii) for run in _pooled(page)]
+    note = (
+        "Each run was evaluated on fresh starts with its deterministic policy. Distances are those "
+        "of the worst robot at the last step. Two figures in a cell: the median, and what 95 % of "
+        "the episodes stay under."
+    )
+    return _section("Runs", _table(head, body), note)
+
+
+def _run_row(run: Run, radii: Sequence[float], colour: int | None = None) -> str:
+    """One run with its colour, or a pooled row without."""
+    mark = "" if colour is None else _tag("i", cls=f"swatch c{colour}")
+    rate = _tag("b", _percent(run.get("success_rate")))
+    cells = [f"{_integer(run.get('successes'))} / {_integer(run.get('episodes'))} {rate}"]
+    cells.append(_interval(run.get("interval")))
+    within = {radius: rate for radius, rate, *_ in _within(run)}
+    cells += [_percent(within.get(radius)) for radius in radii]
+    for quantiles, digits in ((run.get("final_distance"), 3), (run.get("settling_time"), 1)):
+        both = [_decimal(_quantile(quantiles, q), digits) for q in (0.5, 0.95)]
+        cells.append(" / ".join(both) if quantiles else DASH)
+    cells.append(_decimal(run.get("return_mean"), 2))
+    return _row(mark + _text(_name(run)), cells, "pooled" if colour is None else "")
+
+
+def _within(run: Run) -> list[tuple[float, float, float, float]]:
+    """What is known of success by radius: radius, rate, and the ends of the interval."""
+    known = []
+    for within in run.get("radii") or ():
+        radius, rate = _number(within.get("radius")), _number(within.get("rate"))
+        if radius is not None and rate is not None:
+            known.append((radius, rate, *(_pair(within.get("interval")) or (rate, rate))))
+    return sorted(known)
+
+
+def _name(run: Run) -> str:
+    return run.get("label") or run.get("name") or DASH
+
+
+def _pooled(page: Page) -> Sequence[Run]:
+    """The pooled rows given, or one made from the summary when it is of all the runs."""
+    runs, summary = page.get("runs") or (), page.get("summary") or {}
+    if page.get("pooled"):
+        return page.get("pooled") or ()
+    episodes = sum(_number(run.get("episodes")) or 0 for run in runs)
+    if len(runs) < 2 or not episodes or episodes != _number(summary.get("episodes")):
+        return ()
+    pooled = Run(label="pooled", radii=_pooled_radii(runs))
+    pooled.update({key: summary[key] for key in _COUNTS if key in summary})  # type: ignore[typeddict-item]
+    return (pooled,)
+
+
+_COUNTS = ("episodes", "successes", "success_rate", "interval")
+
+
+def _pooled_radii(runs: Sequence[Run]) -> list[Within]:
+    """The rates over all episodes of all runs, at the radii that every run has."""
+    weights = [_number(run.get("episodes")) or 0.0 for run in runs]
+    rates = [{radius: rate for radius, rate, *_ in _within(run)} for run in runs]
+    common = set.intersection(*(set(known) for known in rates))
+    return [
+        {"radius": r, "rate": float(np.average([known[r] for known in rates], weights=weights))}
+        for r in sorted(common)
+    ]
+
+
+def _comparisons(comparisons: Sequence[Comparison]) -> str:
+    if not comparisons:
+        return ""
+    head = ["First", "Second", "Only the first succeeded", "Only the second", "p (McNemar)", ""]
+    body = []
+    for c in comparisons:
+        cells = [_text(c.get("b")), _integer(c.get("only_a")), _integer(c.get("only_b"))]
+        cells += [_p_value(c.get("p_value")), _text(c.get("text"), "")]
+        body.append(_row(_text(c.get("a")), cells))
+    note = (
+        "The same starts for both. McNemar's test asks whether the starts that only one of them "
+        "mastered fall evenly on both sides."
+    )
+    return _section("Compared", _table(head, body, words=(0, 1, 5)), note)
+
+
+def _certificates(certificates: Sequence[Certificate]) -> str:
+    if not certificates:
+        return ""
+    keys = ("evidence", "bound", "confidence", "text")
+    body = [_row(_text(c.get("claim")), [_any(c.get(k)) for k in keys]) for c in certificates]
+    head = ["Claim", "Evidence", "Bound", "Confidence", ""]
+    note = "What was checked, how, and how far it reaches."
+    return _section("Certificates", _table(head, body, words=(0, 1, 4)), note)
+
+
+def _making(page: Page) -> str:
+    facts = [("wall time", _duration(page["wall_time_s"]))] if "wall_time_s" in page else []
+    facts += [(name, _any(value)) for name, value in (page.get("versions") or {}).items()]
+    config = [(path, _any(value)) for path, value in _flatten(page.get("config") or {})]
+    command = page.get("command")
+    body = _tag("pre", _text(command), cls="command") if command else ""
+    for title, pairs in (("Versions and time", facts), ("Configuration", config)):
+        if pairs:
+            rows = [_tag("div", _tag("dt", _text(k)) + _tag("dd", v)) for k, v in pairs]
+            body += _tag("h3", title) + _tag("dl", "".join(rows), cls="pairs")
+    return _section("How it was made", body) if body else ""
+
+
+def _flatten(tree: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    """The leaves of a nested dictionary with their dotted paths."""
+    for key, value in tree.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _section(title: str, body: str, note: str = "") -> str:
+    note = _tag("p", note, cls="note") if note else ""
+    return _tag("section", _tag("h2", title) + note + body)
+
+
+def _table(head: Sequence[str], rows: Sequence[str], words: Sequence[int] = (0,)) -> str:
+    """A table that scrolls sideways on a narrow screen; `words` are the columns set flush left."""
+    names = [
+        _tag("th", name, cls="word" if k in words else None, scope="col")
+        for k, name in enumerate(head)
+    ]
+    body = _tag("thead", _tag("tr", "".join(names))) + _tag("tbody", "".join(rows))
+    table = _tag("table", body, cls=" ".join(f"w{k}" for k in words))
+    return _tag("div", table, cls="scroll", tabindex=0, role="region", aria_label="table")
+
+
+def _row(head: str, cells: Sequence[str], kind: str = "") -> str:
+    body = "".join(_tag("td", cell) for cell in cells)
+    return _tag("tr", _tag("th", head, scope="row") + body, cls=kind or None)
+
+
+# -------------------------------------------------------------------------------------------------
+# Curves
+# -------------------------------------------------------------------------------------------------
+
+Curve = tuple[np.ndarray, np.ndarray]
+
+
+def _curves(runs: Sequence[Run]) -> str:
+    learning = [_learning_chart(runs, "success"), _learning_chart(runs, "return")]
+    charts = [
+        _captioned(chart, caption) for caption, chart in (_radius_chart(runs), *learning) if chart
+    ]
+    if not charts:
+        return ""
+    return _section("Curves", _tag("div", "".join(charts), cls="charts") + _legend(runs))
+
+
+def _captioned(picture: str, caption: str) -> str:
+    return _tag("figure", picture + _tag("figcaption", caption))
+
+
+def _legend(runs: Sequence[Run]) -> str:
+    groups = _groups(runs)
+    names = groups if len(groups) > 1 else [_name(run) for run in runs]
+    marks = [_tag("i", cls=f"swatch c{k % len(PALETTE)}") for k in range(len(names))]
+    items = [_tag("li", mark + _text(name)) for mark, name in zip(marks, names, strict=True)]
+    return _tag("ul", "".join(items), cls="legend")
+
+
+def _groups(runs: Sequence[Run]) -> list[str]:
+    """The algorithms, in order of appearance."""
+    return list(dict.fromkeys(run.get("algorithm") or "" for run in runs))
+
+
+def _colours(runs: Sequence[Run]) -> list[int]:
+    """One colour per algorithm when there are several, else one per run."""
+    groups = _groups(runs)
+    if len(groups) > 1:
+        return [groups.index(run.get("algorithm") or "") % len(PALETTE) for run in runs]
+    return [k % len(PALETTE) for k in range(len(runs))]
+
+
+def learning_curve(run: Run, key: Literal["success", "return"]) -> Curve:
+    """What the log of a run says of `key` against environment steps, without the gaps."""
+    points = [(_number(row.get("steps")), _number(row.get(key))) for row in run.get("log") or ()]
+    known = np.array([point for point in points if None not in point], dtype=float).reshape(-1, 2)
+    return known[:, 0], known[:, 1]
+
+
+def mean_curve(curves: Sequence[Curve]) -> Curve:
+    """The mean over several curves where all of them reach, on the steps of the first."""
+    curves = [curve for curve in curves if len(curve[0])]
+    if not curves:
+        return np.zeros(0), np.zeros(0)
+    low, high = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
+    grid = curves[0][0][(curves[0][0] >= low) & (curves[0][0] <= high)]
+    return grid, np.mean([np.interp(grid, x, y) for x, y in curves], axis=0)
+
+
+def _learning_chart(runs: Sequence[Run], key: Literal["success", "return"]) -> tuple[str, str]:
+    """Caption and picture: thin a line per run, thick the mean of each algorithm."""
+    scale = 100 if key == "success" else 1
+    curves = [(x, scale * y) for x, y in (learning_curve(run, key) for run in runs)]
+    if not any(len(x) for x, _ in curves):
+        return "", ""
+    x_all, y_all = (np.concatenate(values) for values in zip(*curves, strict=True))
+    span = (0.0, 100.0) if key == "success" else (float(y_all.min()), float(y_all.max()))
+    axes = Axes((0.0, float(x_all.max())), span, "environment steps")
+    groups = _groups(runs)
+    kinds = [f"thin c{colour}" for colour in _colours(runs)]
+    marks = [axes.line(*curve, kind) for curve, kind in zip(curves, kinds, strict=True)]
+    for k, group in enumerate(groups):
+        own = [c for run, c in zip(runs, curves, strict=True) if run.get("algorithm", "") == group]
+        if len(own) > 1:
+            colour = f" c{k % len(PALETTE)}" if len(groups) > 1 else ""
+            marks.append(axes.line(*mean_curve(own), f"mean{colour}"))
+    title = {"success": "Success during training (%)", "return": "Return of an episode"}[key]
+    unit = "" if key == "success" else " (sum of rewards)"
+    seeds = ", one thin line per run, thick the mean" if len(runs) > 1 else ""
+    return title + unit + seeds, axes.svg(marks, title)
+
+
+def _radius_chart(runs: Sequence[Run]) -> tuple[str, str]:
+    """Caption and picture: success against how near is near enough."""
+    known = [_within(run) for run in runs]
+    if not any(known):
+        return "", ""
+    axes = Axes((0.0, max(row[-1][0] for row in known if row)), (0.0, 100.0), "radius (m)")
+    bands, lines = [], []
+    for rows, colour in zip(known, _colours(runs), strict=True):
+        if rows:
+            radius, rate, low, high = np.array(rows).T * [[1], [100], [100], [100]]
+            bands.append(axes.band(radius, low, high, f"c{colour}"))
+            lines.append(axes.line(radius, rate, f"thin c{colour}"))
+            lines.append(axes.dots(radius, rate, f"c{colour}"))
+    caption = "Success (%) against the radius asked (m), bands of 95 %"
+    return caption, axes.svg(bands + lines, caption)
+
+
+@dataclass(frozen=True)
+class Axes:
+    """A frame of 360 by 240 units with marks in the coordinates of the data."""
+
+    x_span: tuple[float, float]
+    y_span: tuple[float, float]
+    x_label: str
+    left, right, top, bottom = 46.0, 350.0, 10.0, 200.0
+
+    def x(self, value: Any) -> Any:
+        low, high = self.x_span
+        return self.left + (value - low) / ((high - low) or 1.0) * (self.right - self.left)
+
+    def y(self, value: Any) -> Any:
+        low, high = self.y_span
+        return self.bottom - (value - low) / ((high - low) or 1.0) * (self.bottom - self.top)
+
+    def line(self, x: np.ndarray, y: np.ndarray, kind: str) -> str:
+        return _tag("polyline", cls=kind, points=_points(self.x(x), self.y(y))) if len(x) else ""
+
+    def band(self, x: np.ndarray, low: np.ndarray, high: np.ndarray, kind: str) -> str:
+        x, y = np.concatenate([x, x[::-1]]), np.concatenate([high, low[::-1]])
+        return _tag("polygon", cls=f"band {kind}", points=_points(self.x(x), self.y(y)))
+
+    def dots(self, x: np.ndarray, y: np.ndarray, kind: str) -> str:
+        return "".join(
+            _tag("circle", _tag("title", f"{q:.3g} % within {p:g} m"), cls=kind, cx=a, cy=b, r=2.5)
+            for a, b, p, q in zip(self.x(x), self.y(y), x, y, strict=True)
+        )
+
+    def svg(self, marks: Sequence[str], title: str) -> str:
+        left, right, bottom = self.left, self.right, self.bottom
+        frame = _tag("line", cls="axis", x1=left, x2=right, y1=bottom, y2=bottom)
+        for value in ticks(*self.y_span):
+            y = self.y(value)
+            frame += _tag("line", cls="grid", x1=left, x2=right, y1=y, y2=y)
+            frame += _tag("text", _short(value), x=left - 6, y=y + 4, text_anchor="end")
+        for value in ticks(*self.x_span):
+            x = self.x(value)
+            frame += _tag("line", cls="axis", x1=x, x2=x, y1=bottom, y2=bottom + 4)
+            frame += _tag("text", _short(value), x=x, y=bottom + 17, text_anchor="middle")
+        middle = (left + right) / 2
+        frame += _tag("text", self.x_label, x=middle, y=bottom + 35, text_anchor="middle")
+        return _svg(360, 240, frame + "".join(marks), title)
+
+
+def ticks(low: float | int, high: float | int, about: int = 5) -> list[float]:
+    """Round numbers from `low` to `high`, roughly `about` of them."""
+    if not high > low:
+        return [float(low)]
+    rough = (high - low) / about
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = power * next(m for m in (1, 2, 5, 10) if m * power >= rough * 0.8)
+    return [
+        k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
+    ]
+
+
+def _points(x: np.ndarray, y: np.ndarray, most: int = 240) -> str:
+    keep = np.unique(np.linspace(0, len(x) - 1, min(len(x), most)).astype(int))
+    return " ".join(f"{x[k]:.1f},{y[k]:.1f}" for k in keep)
+
+
+# -------------------------------------------------------------------------------------------------
+# Films
+# -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A film made regular, for the player, the small multiples and `marlyap.draw`."""
+
+    label: str
+    start: str
+    run: str
+    dt: float
+    radius: float
+    targets: np.ndarray  # [0, 1 or agents][2]
+    positions: np.ndarray  # [time][agent][2]
+    headings: np.ndarray | None  # [time][agent]
+    leaders: list[bool]
+    edges: list[list[tuple[int, int]]]  # of length 1 when constant, else [time]
+    distance: np.ndarray  # [time]
+    level: np.ndarray | None  # [time]: L, or the cost
+    level_name: str
+    success: bool | None
+    view: tuple[float, float, float]  # centre and side of the square to show
+
+    @property
+    def detail(self) -> str:
+        """Where it ended and where it came from, in a few words."""
+        last = f"ends {_decimal(self.distance[-1], 3, 'm')} away"
+        return " · ".join([last, *([f"start {self.start}"] if self.start else [])])
+
+    @property
+    def own_targets(self) -> bool:
+        """Whether each agent has a target of its own."""
+        return len(self.targets) == self.positions.shape[1] > 1
+
+    def links(self, k: int) -> list[tuple[int, int]]:
+        """The edges at time `k` whose two ends are known."""
+        known = np.isfinite(self.positions[k]).all(-1)
+        edges = self.edges[k if len(self.edges) > 1 else 0]
+        return [(i, j) for i, j in edges if max(i, j) < len(known) and known[i] and known[j]]
+
+
+def scenes(films: Sequence[Film]) -> list[Scene]:
+    """Regular films, drawn to one scale unless they differ too much in size for that."""
+    made = [scene for film in films if (scene := _scene(film)) is not None]
+    sides = [scene.view[2] for scene in made]
+    if not made or max(sides) > 2.5 * min(sides):
+        return made
+    return [replace(scene, view=(*scene.view[:2], max(sides))) for scene in made]
+
+
+def _scene(film: Film) -> Scene | None:
+    positions = _array(film.get("positions"))
+    if positions.ndim != 3 or not positions.size:
+        return None
+    time, agents = positions.shape[:2]
+    targets = _array(film.get("target")).reshape(-1, 2)
+    headings = (
+        None if film.get("headings") is None else _array(film.get("headings")).reshape(time, agents)
+    )
+    name = next((name for name in ("lyapunov", "cost") if film.get(name) is not None), None)
+    radius = _number(film.get("radius")) or 0.0
+    return Scene(
+        label=str(film.get("label") or "episode"),
+        start="" if film.get("start") is None else str(film.get("start")),
+        run=str(film.get("run") or ""),
+        dt=_number(film.get("dt")) or 0.1,
+        radius=radius,
+        targets=targets,
+        positions=positions,
+        headings=headings,
+        leaders=([bool(flag) for flag in film.get("leaders") or ()] + [False] * agents)[:agents],
+        edges=_edges(film.get("edges"), time),
+        distance=_distance(film, positions, targets),
+        level=None if name is None else _over(film.get(name), time),
+        level_name={"lyapunov": "L", "cost": "cost", None: ""}[name],
+        success=None if film.get("success") is None else bool(film.get("success")),
+        view=_view(positions, targets, radius),
+    )
+
+
+def _distance(film: Film, positions: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    time = len(positions)
+    if film.get("distance") is not None:
+        return _over(film.get("distance"), time)
+    if len(targets) not in (1, positions.shape[1]):
+        return np.full(time, np.nan)
+    return np.linalg.norm(positions - targets, axis=-1).max(-1)
+
+
+def _edges(edges: Any, time: int) -> list[list[tuple[int, int]]]:
+    """Edges over time; one entry when they never change."""
+    plain = [] if edges is None else [np.asarray(e).tolist() for e in edges]
+    moving = any(not e or isinstance(e[0], list) for e in plain)
+    frames = [[(int(i), int(j)) for i, j in frame] for frame in (plain if moving else [plain])]
+    if all(frame == frames[0] for frame in frames):
+        return frames[:1]
+    return (frames + frames[-1:] * time)[:time]
+
+
+def _over(values: Any, time: int) -> np.ndarray:
+    """Values over time, filled with NaN or cut to the length of the film."""
+    known = _array(values).reshape(-1)[:time]
+    return np.concatenate([known, np.full(time - len(known), np.nan)])
+
+
+def _view(positions: np.ndarray, targets: np.ndarray, radius: float) -> tuple[float, float, float]:
+    corners = [positions.reshape(-1, 2), targets - radius, targets + radius]
+    cloud = np.concatenate(corners)
+    cloud = cloud[np.isfinite(cloud).all(-1)]
+    if not len(cloud):
+        return 0.0, 0.0, 2.0
+    low, high = cloud.min(0), cloud.max(0)
+    x, y = (low + high) / 2
+    return float(x), float(y), 1.12 * max(float((high - low).max()), 6 * radius, 1e-3)
+
+
+def _film(scene: Scene) -> dict[str, Any]:
+    """What the player reads."""
+    return {
+        "label": scene.label,
+        "dt": scene.dt,
+        "radius": scene.radius,
+        "targets": _plain(scene.targets),
+        "positions": _plain(scene.positions),
+        "headings": None if scene.headings is None else _plain(scene.headings, 3),
+        "leaders": scene.leaders,
+        "edges": scene.edges,
+        "distance": _plain(scene.distance),
+        "level": None if scene.level is None else _plain(scene.level, significant=True),
+        "levelName": scene.level_name,
+        "view": _plain(np.array(scene.view)),
+    }
+
+
+def _episodes(shown: Sequence[Scene]) -> str:
+    """The buttons that choose an episode."""
+    return "".join(
+        _tag(
+            "button",
+            f"{_tag('b', _text(scene.label))} {_tag('span', _outcome(scene, shown))}",
+            type="button",
+            data_film=k,
+            aria_pressed="true" if k == 0 else "false",
+        )
+        for k, scene in enumerate(shown)
+    )
+
+
+def _outcome(scene: Scene, shown: Sequence[Scene]) -> str:
+    """Whose episode it is, where there are several, and how it went."""
+    run = [scene.run] if scene.run and len({other.run for other in shown}) > 1 else []
+    end = {None: [], True: ["success"], False: ["failure"]}[scene.success]
+    return _text(" · ".join([*run, scene.detail, *end]))
+
+
+def _starts(shown: Sequence[Scene], most: int = 6) -> str:
+    figures = [
+        _captioned(_panel(scene), f"{_tag('b', _text(scene.label))} {_outcome(scene, shown)}")
+        for scene in shown[:most]
+    ]
+    note = (
+        "Paths from the start (small circle) to the last step, with a dot every second. Leaders "
+        "are filled, and the target's ring is to scale."
+    )
+    body = _tag("div", "".join(figures), cls="charts")
+    return _section("A few starts", body, note) if figures else ""
+
+
+def _panel(scene: Scene) -> str:
+    """The paths of one episode in a square of 300 units."""
+    x0, y0, side = scene.view
+    scale = 300 / side
+    place = (scene.positions - (x0, y0)) * (scale, -scale) + 150
+    rings = (scene.targets - (x0, y0)) * (scale, -scale) + 150
+    body = ""
+    for value in ticks(x0 - side / 2, x0 + side / 2):
+        body += _grid_line(150 + (value - x0) * scale, value, upright=True)
+    for value in ticks(y0 - side / 2, y0 + side / 2):
+        body += _grid_line(150 - (value - y0) * scale, value, upright=False)
+    for k, (x, y) in enumerate(rings):
+        own = f" c{k % len(PALETTE)}" if scene.own_targets else ""
+        body += _tag("circle", cls="target" + own, cx=x, cy=y, r=max(scene.radius * scale, 2.5))
+    for i, j in scene.links(-1):
+        (a, b), (c, d) = place[-1, i], place[-1, j]
+        body += _tag("line", cls="edge", x1=a, y1=b, x2=c, y2=d)
+    body += "".join(_path(scene, place[:, k], k) for k in range(place.shape[1]))
+    return _svg(300, 300, body, f"trajectories, {scene.label}", "square")
+
+
+def _grid_line(at: float, value: float | int, *, upright: bool) -> str:
+    """A line of the grid with its number, but none in the corners."""
+    label = f"{_short(value)} m" if 24 < at < 276 else ""
+    if upright:
+        return _tag("line", cls="grid", x1=at, x2=at, y1=0, y2=300) + _tag(
+            "text", label, x=at + 3, y=296
+        )
+    return _tag("line", cls="grid", x1=0, x2=300, y1=at, y2=at) + _tag("text", label, x=3, y=at - 3)
+
+
+def _path(scene: Scene, place: np.ndarray, agent: int) -> str:
+    """One agent's path, a dot a second, and its shape at the end."""
+    known = np.isfinite(place).all(-1)
+    if not known.any():
+        return ""
+    colour, path = f"c{agent % len(PALETTE)}", place[known]
+    every = max(round(1 / scene.dt), 1)
+    body = _tag("polyline", cls=f"thin {colour}", points=_points(*path.T))
+    for x, y in place[every:-1:every]:
+        body += _tag("circle", cls=colour, cx=x, cy=y, r=1.7) if np.isfinite(x + y) else ""
+    body += _tag("circle", cls=f"start {colour}", cx=path[0, 0], cy=path[0, 1], r=3.2)
+    angle = math.nan if scene.headings is None else float(scene.headings[known][-1, agent])
+    turn = f"rotate({-math.degrees(angle):.1f})"
+    shape = (
+        _tag("path", d="M9 0L-6 5.5L-6 -5.5Z", transform=turn)
+        if math.isfinite(angle)
+        else _tag("circle", r=5)
+    )
+    ring = _tag("circle", cls="crown", r=11) if scene.leaders[agent] else ""
+    role = "leader" if scene.leaders[agent] else "follower"
+    x, y = path[-1]
+    return body + _tag(
+        "g", shape + ring, cls=f"{role} {colour}", transform=f"translate({x:.1f} {y:.1f})"
+    )
+
+
+# -------------------------------------------------------------------------------------------------
+# Words and numbers
+# -------------------------------------------------------------------------------------------------
+
+
+def _tag(name: str, content: str = "", **attributes: Any) -> str:
+    """An element; `cls` stands for class, and an attribute that is None is left out."""
+    text = ""
+    for key, value in attributes.items():
+        if value is not None:
+            shown = f"{value:.1f}" if isinstance(value, float) else escape(str(value), quote=True)
+            text += f' {"class" if key == "cls" else key.replace("_", "-")}="{shown}"'
+    return f"<{name}{text}>{content}</{name}>"
+
+
+def _svg(width: int, height: int, content: str, title: str, kind: str | None = None) -> str:
+    head = {"viewBox": f"0 0 {width} {height}", "role": "img", "aria_label": title, "cls": kind}
+    return _tag("svg", content, **head)
+
+
+def _text(value: Any, missing: str = DASH) -> str:
+    return missing if value is None else escape(str(value), quote=True)
+
+
+def _number(value: Any) -> float | None:
+    """A finite number, or None."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _pair(values: Any) -> tuple[float, float] | None:
+    low, high = (_number(v) for v in (*(values if values is not None else ()), None, None)[:2])
+    return None if low is None or high is None else (low, high)
+
+
+def _array(values: Any) -> np.ndarray:
+    """Floats, with None as NaN."""
+    return np.asarray([] if values is None else values, dtype=float)
+
+
+def _quantile(quantiles: Mapping[Any, Any] | None, q: float) -> float | None:
+    return next((value for key, value in (quantiles or {}).items() if _number(key) == q), None)
+
+
+def _integer(value: Any) -> str:
+    number = _number(value)
+    return DASH if number is None else f"{number:,.0f}".replace(",", "\u202f")
+
+
+def _decimal(value: Any, digits: int, unit: str = "") -> str:
+    number = _number(value)
+    return (
+        DASH
+        if number is None
+        else f"{number:.{digits}f}{' ' + unit if unit else ''}".replace("-", "\u2212")
+    )
+
+
+def _percent(value: Any) -> str:
+    """A rate in per cent; only an exact one is written as 0 or 100."""
+    rate = _number(value)
+    if rate is None:
+        return DASH
+    if rate in (0.0, 1.0):
+        return f"{100 * rate:.0f} %"
+    return f"{min(max(100 * rate, 0.1), 99.9):.1f} %"
+
+
+def _interval(values: Any) -> str:
+    pair = _pair(values)
+    return (
+        DASH
+        if pair is None
+        else f"{_percent(pair[0]).removesuffix(' %')} {DASH} {_percent(pair[1])}"
+    )
+
+
+def _p_value(value: Any) -> str:
+    number = _number(value)
+    if number is None:
+        return DASH
+    return "&lt; 0.0001" if number < 1e-4 else f"{number:.2g}"
+
+
+def _short(value: float | int) -> str:
+    """A tick's label."""
+    for size, letter in ((1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:g}{letter}".replace("-", "\u2212")
+    return f"{0.0 if abs(value) < 1e-12 else value:.6g}".replace("-", "\u2212")
+
+
+def _duration(seconds: Any) -> str:
+    number = _number(seconds)
+    if number is None:
+        return DASH
+    if number < 60:
+        return f"{number:.1f} s"
+    minutes, seconds = divmod(round(number), 60)
+    hours, minutes = divmod(minutes, 60)
+    parts = ((hours, "h"), (minutes, "min"), (seconds, "s"))
+    return " ".join(f"{count} {unit}" for count, unit in parts if count)
+
+
+def _any(value: Any) -> str:
+    """A value of unknown kind as text."""
+    plain = _plain(value, significant=True)
+    if plain is None:
+        return DASH
+    if isinstance(plain, bool):
+        return "yes" if plain else "no"
+    if isinstance(plain, list) and not any(isinstance(item, list | dict) for item in plain):
+        return ", ".join(_any(item) for item in plain) or DASH
+    return _text(
+        plain if isinstance(plain, str) else json.dumps(plain, ensure_ascii=False, default=str)
+    )
+
+
+def _plain(value: Any, digits: int = 4, *, significant: bool = False) -> Any:
+    """Python's own numbers, rounded, with None for what is not finite."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            return None
+        value = float(f"{value:.{digits}g}") if significant else round(value, digits)
+        return int(value) if value == int(value) and abs(value) < 1e6 else value
+    if isinstance(value, Mapping):
+        return {
+            str(key): _plain(item, digits, significant=significant) for key, item in value.items()
+        }
+    if isinstance(value, list | tuple):
+        return [_plain(item, digits, significant=significant) for item in value]
+    return value
+
+
+def _json(value: Any) -> str:
+    """JSON that can stand inside a script element, whatever the strings say."""
+    dense = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return dense.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
