@@ -121,9 +121,7 @@ class Page(TypedDict):
     generated: NotRequired[str]  # date
     summary: NotRequired[Summary]
     runs: NotRequired[Sequence[Run]]
-    pooled: NotRequired[
-        Sequence[Run]
-    ]  # rows over several seeds; one is made from the summary when absent
+    pooled: NotRequired[Sequence[Run]]  # over several seeds; else made from the summary
     films: NotRequired[Sequence[Film]]
     comparisons: NotRequired[Sequence[Comparison]]
     certificates: NotRequired[Sequence[Certificate]]
@@ -390,14 +388,18 @@ def _legend(runs: Sequence[Run]) -> str:
 
 def _groups(runs: Sequence[Run]) -> list[str]:
     """The algorithms, in order of appearance."""
-    return list(dict.fromkeys(run.get("algorithm") or "" for run in runs))
+    return list(dict.fromkeys(_group(run) for run in runs))
+
+
+def _group(run: Run) -> str:
+    return run.get("algorithm") or ""
 
 
 def _colours(runs: Sequence[Run]) -> list[int]:
     """One colour per algorithm when there are several, else one per run."""
     groups = _groups(runs)
     if len(groups) > 1:
-        return [groups.index(run.get("algorithm") or "") % len(PALETTE) for run in runs]
+        return [groups.index(_group(run)) % len(PALETTE) for run in runs]
     return [k % len(PALETTE) for k in range(len(runs))]
 
 
@@ -431,7 +433,7 @@ def _learning_chart(runs: Sequence[Run], key: Literal["success", "return"]) -> t
     kinds = [f"thin c{colour}" for colour in _colours(runs)]
     marks = [axes.line(*curve, kind) for curve, kind in zip(curves, kinds, strict=True)]
     for k, group in enumerate(groups):
-        own = [c for run, c in zip(runs, curves, strict=True) if run.get("algorithm", "") == group]
+        own = [c for run, c in zip(runs, curves, strict=True) if _group(run) == group]
         if len(own) > 1:
             colour = f" c{k % len(PALETTE)}" if len(groups) > 1 else ""
             marks.append(axes.line(*mean_curve(own), f"mean{colour}"))
