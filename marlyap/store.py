@@ -39,9 +39,11 @@ import numpy as np
 
 from marlyap.errors import UserError
 
+
 SCHEMA = 1
 PAYLOAD, MANIFEST = "arrays.safetensors", "manifest.json"
 JSON_LIMIT, JSON_DEPTH = 16 * 2**20, 64
+RETRIES = 8  # of reading what others keep replacing
 # NumPy's name of each dtype, and that of safetensors
 DTYPES = {"bool": "BOOL", "float32": "F32", "float64": "F64"}
 DTYPES |= {f"int{bits}": f"I{bits}" for bits in (8, 16, 32, 64)}
@@ -57,7 +59,7 @@ MENDS = {
     "move away what is already there": (errno.EEXIST, errno.ENOTEMPTY),
 }
 
-Arrays = Mapping[str, np.ndarray]
+Arrays = Mapping[str, Any]  # of whatever np.asarray takes, JAX's arrays too
 Table = Mapping[str, Mapping[str, Any]]
 
 
@@ -72,7 +74,6 @@ def write(
     directory: Path, kind: str, arrays: Arrays, meta: Mapping[str, Any], *, replace: bool = False
 ) -> None:
     """Store `arrays` and the JSON object `meta` as `directory`, whole and durable or not at all."""
-    directory = Path(directory)
     plain = {key: _plain(key, array) for key, array in arrays.items()}
     table = _table(plain)
     header, slots = _layout(table)
@@ -89,17 +90,17 @@ def write(
 
 def read(directory: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and the meta that were stored as `directory`, every byte of them verified."""
-    directory = Path(directory)
-    handle = _open_directory(directory)
-    try:
-        return _read_at(handle, directory, kind)
-    except CorruptError:
-        with suppress(OSError):  # replaced while it was being read?
-            if not os.path.samestat(os.fstat(handle), os.stat(directory)):
-                return read(directory, kind)
-        raise
-    finally:
-        os.close(handle)
+    attempts = 0
+    while True:
+        handle = _open_directory(directory)
+        try:
+            return _read_at(handle, directory, kind)
+        except CorruptError:
+            attempts += 1
+            if attempts == RETRIES or not _has_moved(handle, directory):
+                raise
+        finally:
+            os.close(handle)
 
 
 def expect(arrays: Mapping[str, Any], like: Mapping[str, Any], source: str) -> None:
@@ -142,20 +143,20 @@ class Checkpoints:
     keep: int = 2
 
     def path(self, step: int) -> Path:
-        return Path(self.directory) / f"step-{step:09d}"
+        return self.directory / f"step-{step:09d}"
 
     def steps(self) -> list[int]:
         """The steps that are there, oldest first, whether or not they can be read."""
-        directory = Path(self.directory)
-        olds = [scratch[1] for scratch in _scratches(directory) if scratch[4] == "old"]
-        found = (re.fullmatch(r"step-(\d{9,18})", name) for name in [*_names(directory), *olds])
+        names = _names(self.directory)
+        names += [scratch[1] for scratch in _scratches(self.directory) if scratch[4] == "old"]
+        found = (re.fullmatch(r"step-(\d{9,18})", name) for name in names)
         return sorted({int(name[1]) for name in found if name})
 
     def save(self, step: int, arrays: Arrays, meta: Mapping[str, Any]) -> None:
         """Store `step`; older checkpoints go only once it is durable."""
         with _explained(self.path(step)):
-            Path(self.directory).mkdir(exist_ok=True)
-            sweep(Path(self.directory))
+            self.directory.mkdir(exist_ok=True)
+            sweep(self.directory)
             self._clear_the_way(step)
         write(self.path(step), self.kind, arrays, meta, replace=True)
         for old in self.steps()[: -self.keep]:
@@ -190,7 +191,7 @@ class Checkpoints:
 @contextmanager
 def lock(directory: Path) -> Iterator[None]:
     """Be the one process that writes in `directory`; the system frees the lock however it ends."""
-    path = Path(directory) / ".lock"
+    path = directory / ".lock"
     with _explained(path):
         file = open(path, "a+")
     with file:
@@ -212,7 +213,6 @@ def lock(directory: Path) -> Iterator[None]:
 
 def write_text_atomic(path: Path, text: str) -> None:
     """Replace the file by `text`; at every instant the old or the new one is there, whole."""
-    path = Path(path)
     with _beside(path) as scratch:
         _write_file(scratch, [text.encode()])
         os.replace(scratch, path)
@@ -221,7 +221,7 @@ def write_text_atomic(path: Path, text: str) -> None:
 
 def read_json(path: Path, limit_bytes: int = JSON_LIMIT) -> Any:
     """Strict JSON: no key twice, no NaN or infinity, no unpaired surrogate, no deep nesting."""
-    return _json(_content(Path(path), limit_bytes).tobytes(), path)
+    return _json(_content(path, limit_bytes).tobytes(), path)
 
 
 def append_line(path: Path, text: str) -> None:
@@ -229,7 +229,7 @@ def append_line(path: Path, text: str) -> None:
     line = text.encode() + b"\n"
     if b"\n" in line[:-1]:
         raise ValueError("a line cannot hold a line break")
-    with _explained(Path(path)), open(path, "a+b", buffering=0) as file:
+    with _explained(path), open(path, "a+b", buffering=0) as file:
         end = file.seek(0, os.SEEK_END)
         if end and os.pread(file.fileno(), 1, end - 1) != b"\n":
             file.truncate(end := os.pread(file.fileno(), end, 0).rfind(b"\n") + 1)
@@ -243,21 +243,21 @@ def append_line(path: Path, text: str) -> None:
 
 def read_jsonl(path: Path, limit_bytes: int = 16 * JSON_LIMIT) -> list[Any]:
     """The value on each line; a last one without its line break was cut short and is left out."""
-    lines = _content(Path(path), limit_bytes).tobytes().split(b"\n")[:-1]
+    lines = _content(path, limit_bytes).tobytes().split(b"\n")[:-1]
     return [_json(line, f"{path}, line {number}") for number, line in enumerate(lines, 1)]
 
 
 # --- The payload and its manifest ----------------------------------------------------------------
 
 
-def _plain(key: str, array: np.ndarray) -> np.ndarray:
+def _plain(key: str, array: Any) -> np.ndarray:
     """The array in C order and little endian, copied only where it is not so already."""
     array = np.asarray(array)
     if array.dtype.name not in DTYPES:
         known = ", ".join(DTYPES)
         raise UserError(f"array {key!r} has dtype {array.dtype}; convert it to one of {known}.")
-    if not isinstance(key, str) or key == "__metadata__":
-        raise UserError(f"{key!r} cannot name an array; use another string.")
+    if key == "__metadata__":
+        raise UserError(f"{key!r} cannot name an array; use another name.")
     return np.asarray(array, dtype=array.dtype.newbyteorder("<"), order="C")
 
 
@@ -309,8 +309,8 @@ def _manifest(kind: str, meta: Mapping[str, Any], payload: list[Any], table: Tab
 
 def _sealed(body: Mapping[str, Any]) -> bytes:
     """The one way to write `body`, its own hash included, so that no altered byte passes."""
-    seal = _sha256([json.dumps(body, allow_nan=False).encode()])
-    return json.dumps({**body, "sha256": seal}, indent=1, allow_nan=False).encode() + b"\n"
+    seal = _sha256([json.dumps(body).encode()])
+    return json.dumps({**body, "sha256": seal}, indent=1).encode() + b"\n"
 
 
 @functools.cache
@@ -546,14 +546,25 @@ def _install(scratch: Path, directory: Path) -> None:
 
 def _open_directory(directory: Path) -> int:
     """A handle on the directory or, while it is being replaced, on the old one beside it."""
-    olds = [x[0] for x in _scratches(directory.parent) if x[4] == "old" and x[1] == directory.name]
-    reason = ""
-    for path in (directory, *map(directory.with_name, olds), directory):
+    flags, reason = os.O_RDONLY | os.O_DIRECTORY, ""
+    for _ in range(RETRIES):
         try:
-            return os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+            return os.open(directory, flags)
         except OSError as error:
             reason = error.strerror
+        for scratch in _scratches(directory.parent):
+            if scratch[4] == "old" and scratch[1] == directory.name:
+                with suppress(OSError):
+                    return os.open(directory.with_name(scratch[0]), flags)
     raise CorruptError(f"{directory} is not a stored directory ({reason}); check the path.")
+
+
+def _has_moved(handle: int, directory: Path) -> bool:
+    """Whether the open directory was replaced, and perhaps removed, since."""
+    try:
+        return not os.path.samestat(os.fstat(handle), os.stat(directory))
+    except OSError:
+        return True
 
 
 def _discard(directory: Path) -> None:
