@@ -43,7 +43,7 @@ from marlyap.errors import UserError
 SCHEMA = 1
 PAYLOAD, MANIFEST = "arrays.safetensors", "manifest.json"
 JSON_LIMIT, JSON_DEPTH = 16 * 2**20, 64
-RETRIES = 8  # of reading what others keep replacing
+RETRIES = 16  # of reading what others keep replacing
 # NumPy's name of each dtype, and that of safetensors
 DTYPES = {"bool": "BOOL", "float32": "F32", "float64": "F64"}
 DTYPES |= {f"int{bits}": f"I{bits}" for bits in (8, 16, 32, 64)}

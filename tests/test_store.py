@@ -732,7 +732,7 @@ def test_a_replacement_cut_in_two_is_read_and_put_back(tmp_path):
 def test_a_replacement_cut_in_two_may_be_damaged_as_well(stored):
     damage(stored)
     os.rename(stored, stored.parent / f".policy.{dead_pid()}-00000000-00000000.old")
-    assert "damaged in array 'key'" in refused(stored)
+    assert "damaged in array 'step'" in refused(stored)
 
 
 HOLDER = """
