@@ -1,0 +1,155 @@
+"""Multi-agent soft actor-critic: Algorithm 1, and Algorithm 2 when given a Lyapunov constraint.
+
+    paper                          here                                      equation
+    s_t, a_t, r, s_{t+1}           b.features, b.action, b.reward, b.next_features
+    s_i (local)                    b.obs[i], b.next_obs[i]                   section 2.1
+    pi_phi_1 ... pi_phi_N          pi                                        (5)
+    a, a_{t+1} ~ pi_phi            now.action, nxt.action
+    Q_theta^1, Q_theta^2           Q, returns both                           (6)
+    Q_theta-bar                    Q_bar
+    alpha, H-bar                   exp(log_alpha), agents * entropy          (12)
+    L_psi, Delta L                 L, constraint.penalty                     (14)
+    gamma, tau                     gamma, tau
+    iota_Q, iota_pi, iota_alpha    rate_Q, rate_pi, rate_alpha
+
+Numbers count the paper's displayed equations: (1)-(4) values and Bellman operator, (5) joint
+entropy, (6)-(8) J_Q, its gradient and delta_Q, (9)-(11) policy improvement, (12) temperature,
+(13) Theorem 1, (14) the objective with Delta L. Where the printed equation is wrong the method
+says what was mended.
+"""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+from marlyap.algorithm import AbstractAlgorithm
+from marlyap.constraint import AbstractConstraint, Unconstrained
+from marlyap.errors import UserError
+from marlyap.learn import Learnt, polyak
+from marlyap.nets import Actors, Critic, Greedy, Sample, Sampled
+from marlyap.types import Scalar, Transition
+
+
+class Learner(eqx.Module):
+    pi: Learnt[Actors]
+    pi_mean: Actors  # running mean of pi: the policy that is handed out
+    Q: Learnt[Critic]
+    Q_bar: Critic
+    log_alpha: Learnt[Scalar]
+    L: PyTree  # the constraint's
+
+
+class MASAC(AbstractAlgorithm):
+    """One central twin critic, one Gaussian actor per agent on its own observation."""
+
+    gamma: float = 0.95  # discount
+    tau: float = 0.005  # how fast the target critics follow
+    rate_pi: float = 3e-4  # actor learning rate
+    rate_Q: float = 3e-3  # critic learning rate
+    rate_alpha: float = 3e-4  # temperature learning rate, on its logarithm
+    alpha: float = 0.1  # temperature to begin with
+    entropy: float = -2.0  # target entropy per agent (nats)
+    batch: int = 256  # transitions per update
+    n_step: int = 1  # steps summed in the critic's target
+    reward_scale: float = 2.0  # factor on the reward
+    actor_width: int = 64  # units in each of two hidden layers
+    critic_width: int = 64  # units in each of two hidden layers
+    normalise: bool = True  # LayerNorm in the critics
+    heads: Literal["team", "agent"] = "team"  # one value for the team, or one for each agent's cost
+    shared: bool = False  # one set of actor weights for all agents
+    average: float = 1e-3  # how fast the policy handed out follows the actor; 1 is the actor itself
+    keep_Q: bool = True  # False drops Q from the policy objective (Han et al. 2020)
+    constraint: AbstractConstraint = Unconstrained()
+
+    @property
+    def foresight(self):
+        return self.constraint.foresight
+
+    def init(self, shape, key):
+        k_pi, k_Q, k_L = jax.random.split(key, 3)
+        pi = Actors(shape, self.actor_width, self.shared, key=k_pi)
+        heads = shape.agents if self.heads == "agent" else 1
+        Q = Critic(shape, self.critic_width, heads, self.normalise, key=k_Q)
+        log_alpha = jnp.log(jnp.full((), self.alpha, jnp.float32))
+        L = self.constraint.init(shape, k_L)
+        return Learner(Learnt.of(pi), pi, Learnt.of(Q), Q, Learnt.of(log_alpha), L)
+
+    def J_Q(self, Q: Critic, l: Learner, b: Transition, nxt: Sample) -> Scalar:
+        """Eq. (6), the soft Bellman residual of both critics.
+
+        The printed target adds the entropy to a V that already has it; here it enters once,
+        at s_{t+1}, with the smaller target twin.
+        """
+        alpha = jnp.exp(l.log_alpha.value)
+        Q_next = jnp.min(l.Q_bar(b.next_features, nxt.action), axis=0)
+        V_next = Q_next - alpha * jnp.sum(nxt.log_prob)
+        y = self.reward_scale * self.team(b.reward) + b.discount * V_next
+        return 0.5 * jnp.sum(jnp.mean((Q(b.features, b.action) - y[None]) ** 2, axis=1))
+
+    def J_pi(self, now: Sample, nxt: Sample, l: Learner, b: Transition) -> Scalar:
+        """Eq. (10) as a function of the drawn actions; (14) when there is a constraint.
+
+        All actions come from the current policies; the smaller twin is used here too.
+        """
+        alpha = jnp.exp(l.log_alpha.value)
+        Q = jnp.mean(jnp.min(l.Q.value(b.features, now.action), axis=0))
+        beta_Delta_L = self.constraint.penalty(l.L, b, now, nxt)
+        return alpha * jnp.sum(now.log_prob) - self.keep_Q * Q + beta_Delta_L
+
+    def J_alpha(self, log_alpha: Scalar, now: Sample) -> Scalar:
+        """Eq. (12), with one temperature and the joint entropy."""
+        surplus = jnp.sum(now.log_prob + self.entropy)
+        return -jnp.exp(log_alpha) * surplus
+
+    def update(self, learner, b, key, decay):
+        """The assignments of Algorithm 2 in its order; without a constraint, of Algorithm 1."""
+        l = learner
+        noise = jax.random.normal(key, (2, *b.action.shape))
+
+        # a ~ pi_phi(. | s_t) and a_{t+1} ~ pi_phi(. | s_{t+1}): one pass serves every objective
+        draw = lambda pi: (
+            jax.vmap(pi.sample)(b.obs, noise[0]),
+            jax.vmap(pi.sample)(b.next_obs, noise[1]),
+        )
+        (now, nxt), chain_rule = eqx.filter_vjp(draw, l.pi.value)
+
+        # theta <- theta - iota_Q grad J_Q
+        J_Q = lambda Q, b, nxt: self.J_Q(Q, l, b, nxt)
+        Q, loss_Q = l.Q.descend(J_Q, b, nxt, rate=decay * self.rate_Q)
+        l = eqx.tree_at(lambda l: l.Q, l, Q)
+
+        # phi <- phi - iota_pi grad J_pi, eq. (11): first to the actions, then through the actors
+        J_pi = lambda now, nxt, b: self.J_pi(now, nxt, l, b)
+        E_J_pi = jax.value_and_grad(lambda drawn: jnp.mean(jax.vmap(J_pi)(*drawn, b)))
+        loss_pi, to_actions = E_J_pi((now, nxt))
+        (gradient,) = chain_rule(to_actions)
+        pi = l.pi.step(gradient, decay * self.rate_pi)
+
+        # alpha <- alpha - iota_alpha grad J_alpha
+        log_alpha, _ = l.log_alpha.descend(self.J_alpha, now, rate=decay * self.rate_alpha)
+
+        # theta-bar <- tau theta + (1 - tau) theta-bar, and psi <- psi - iota_L grad J_L
+        Q_bar = polyak(Q.value, l.Q_bar, self.tau)
+        L, info = self.constraint.update(l.L, b, now, nxt, decay)
+
+        pi_mean = polyak(pi.value, l.pi_mean, self.average)
+        info |= {
+            "J_Q": loss_Q,
+            "J_pi": loss_pi,
+            "alpha": jnp.exp(log_alpha.value),
+            "entropy": -jnp.mean(jnp.sum(now.log_prob, axis=1)),
+        }
+        return Learner(pi, pi_mean, Q, Q_bar, log_alpha, L), info
+
+    def explore(self, learner):
+        return Sampled(learner.pi.value)
+
+    def exploit(self, learner):
+        return Greedy(learner.pi_mean)
+
+    def team(self, per_agent):
+        """What the critics' heads stand for: the team's mean, or each agent."""
+        return per_agent if self.heads == "agent" else jnp.mean(per_agent, keepdims=True)

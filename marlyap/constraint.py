@@ -1,0 +1,57 @@
+"""What may be added to the policy objective, learnt beside it."""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+from marlyap.nets import Sample, Shape
+from marlyap.types import Key, Scalar, Transition
+
+
+class AbstractConstraint(eqx.Module):
+    """A term of the policy objective (`penalty`) and how what it is made of is learnt (`update`)."""
+
+    @property
+    @abc.abstractmethod
+    def foresight(self) -> tuple[int, bool]:
+        """T of L_target, and whether episodes are to be rolled T steps further to have it."""
+
+    @abc.abstractmethod
+    def init(self, shape: Shape, key: Key) -> PyTree:
+        """What the constraint learns, before it has learnt anything."""
+
+    @abc.abstractmethod
+    def penalty(self, L: PyTree, b: Transition, now: Sample, nxt: Sample) -> Scalar:
+        """What one transition adds to J_pi; `now` and `nxt` are drawn from the current policy."""
+
+    @abc.abstractmethod
+    def update(
+        self, L: PyTree, b: Transition, now: Sample, nxt: Sample, decay: Scalar
+    ) -> tuple[PyTree, dict[str, Scalar]]:
+        """One step of learning on a batch (all arguments but L and decay are batched)."""
+
+    @abc.abstractmethod
+    def value(self, L: PyTree, b: Transition) -> Scalar:
+        """L(s, a) of one transition, for reports; 0 where there is no Lyapunov function."""
+
+
+class Unconstrained(AbstractConstraint):
+    """Algorithm 1: nothing is added."""
+
+    @property
+    def foresight(self):
+        return 1, False
+
+    def init(self, shape, key):
+        return None
+
+    def penalty(self, L, b, now, nxt):
+        return jnp.zeros(())
+
+    def update(self, L, b, now, nxt, decay):
+        return L, {}
+
+    def value(self, L, b):
+        return jnp.zeros(())

@@ -1,0 +1,133 @@
+"""The networked Markov game MG = <G, S, A, P, r, gamma> of section 2.1.
+
+S and A are products over agents, P is deterministic, and the discount gamma belongs to the
+learning rule.
+"""
+
+import abc
+from functools import lru_cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from marlyap import graph as graphs
+from marlyap.dynamics import AbstractDynamics
+from marlyap.errors import UserError
+from marlyap.sensing import goal_errors
+from marlyap.types import Action, Features, Key, Obs, Scalar, State
+
+
+class AbstractGame(eqx.Module):
+    """A task says where an episode starts and what each agent sees.
+
+    Its fields are its parameters. The dynamics, the graph and the judgement (cost, reward,
+    success) are given, and may be replaced.
+    """
+
+    agents: eqx.AbstractVar[int]
+    leaders: eqx.AbstractVar[tuple[int, ...]]
+    graph: eqx.AbstractVar[str]
+    radius: eqx.AbstractVar[float]
+    dt: eqx.AbstractVar[float]
+    horizon: eqx.AbstractVar[int]
+    dynamics: eqx.AbstractVar[AbstractDynamics]
+
+    def __check_init__(self):
+        n = self.agents
+        if not 1 <= n <= 4096:
+            raise UserError(f"agents: {n} is out of range; a team has 1 to 4096 agents.")
+        if not 0 < self.dt <= 10:
+            raise UserError(f"dt: {self.dt} s is out of range; take a step in (0, 10] seconds.")
+        if not 1 <= self.horizon <= 100_000:
+            raise UserError(f"horizon: {self.horizon} is out of range; take 1 to 100000 steps.")
+        if not 0 < self.radius < 1e6:
+            raise UserError(f"radius: {self.radius} m must be a positive distance in metres.")
+        if len(set(self.leaders)) != len(self.leaders):
+            raise UserError(f"leaders: {self.leaders} names an agent twice.")
+        if not self.leaders or not all(0 <= i < n for i in self.leaders):
+            raise UserError(
+                f"leaders: {self.leaders} must name at least one agent, each from 0 to {n - 1}."
+            )
+        graphs.adjacency(self.graph, n)
+
+    @abc.abstractmethod
+    def reset(self, key: Key) -> State:
+        """The state an episode starts from."""
+
+    @abc.abstractmethod
+    def observe(self, state: State) -> Obs:
+        """o_i, row i made of agent i's own state and its neighbours' only (section 2.1)."""
+
+    def distance(self, state: State) -> Float[Array, "agent"]:
+        """How far each agent is from where it has to be (m)."""
+        return jnp.linalg.norm(self.positions(state) - state.goal, axis=1)
+
+    def errors(self, state: State) -> Float[Array, "agent error"]:
+        """Coordinates that are all zero exactly on the target set."""
+        return goal_errors(self.dynamics, state)
+
+    def features(self, state: State) -> Features:
+        """The global state s up to a shift, for the central critic: errors, then headings."""
+        heading = jax.vmap(self.dynamics.heading)(state.x)
+        return jnp.concatenate([self.errors(state), heading], axis=1)
+
+    def costs(self, state: State, action: Action) -> Float[Array, "agent"]:
+        """c_i(s, a) >= 0 and 0 on the target set; the team's cost c is their mean."""
+        return self.distance(state)
+
+    def rewards(self, state: State, action: Action) -> Float[Array, "agent"]:
+        """r_i(s, a); the team's reward r is their mean."""
+        return -self.costs(state, action)
+
+    def terminated(self, state: State) -> Bool[Array, ""]:
+        """Whether the game itself has ended here. The time limit `horizon` only truncates."""
+        return jnp.asarray(False)
+
+    def step(self, state: State, action: Action) -> State:
+        """s_{t+1} = f(s_t, a_t) for actions in [-1, 1] (Assumption 2)."""
+        x = jax.vmap(lambda x, a: self.dynamics.step(x, a, self.dt))(state.x, action)
+        return State(x=x, goal=state.goal, t=state.t + 1, memory=state.memory)
+
+    def cost(self, state: State, action: Action) -> Scalar:
+        """c(s, a), the mean over agents (Assumption 1)."""
+        return jnp.mean(self.costs(state, action))
+
+    def success(self, state: State) -> Bool[Array, ""]:
+        """Every agent is within `radius` of its goal."""
+        return jnp.all(self.distance(state) <= self.radius)
+
+    def positions(self, state: State) -> Float[Array, "agent 2"]:
+        """Where the agents are (m)."""
+        return jax.vmap(self.dynamics.position)(state.x)
+
+    @property
+    def adjacency(self) -> Bool[np.ndarray, "agent agent"]:
+        """Which pairs may interact; for a proximity disk, all."""
+        return _adjacency(self.graph, self.agents)
+
+    @property
+    def slots(self) -> Int[np.ndarray, "agent slot"]:
+        """Each agent's neighbours in ascending order, padded with -1."""
+        return graphs.neighbours(self.adjacency)
+
+    @property
+    def leads(self) -> Bool[np.ndarray, "agent"]:
+        """Which agents know their goal."""
+        return np.isin(np.arange(self.agents), self.leaders)
+
+    def linked(self, state: State) -> Bool[Array, "agent agent"]:
+        """Which pairs interact in this state."""
+        linked = jnp.asarray(self.adjacency)
+        reach = graphs.disk_radius(self.graph)
+        if reach is None:
+            return linked
+        p = self.positions(state)
+        return linked & (jnp.linalg.norm(p[:, None] - p[None, :], axis=-1) <= reach)
+
+
+@lru_cache(maxsize=64)
+def _adjacency(graph: str, n: int) -> Bool[np.ndarray, "agent agent"]:
+    return graphs.adjacency(graph, n)

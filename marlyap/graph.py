@@ -1,0 +1,96 @@
+"""The interaction graph G = <I, E> of section 2.1: undirected, connected, written as text.
+
+    complete | path | ring | star      named graphs on n agents
+    disk:0.8                           neighbours are those closer than 0.8 m at this instant
+    0-1,1-2,1-3                        any edge list
+"""
+
+import re
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from marlyap.errors import UserError
+
+
+NAMED = ("complete", "path", "ring", "star")
+
+
+def adjacency(graph: str, n: int) -> Bool[np.ndarray, "agent agent"]:
+    """Which pairs may interact. For `disk:R` all pairs may; distance then decides at each step.
+
+    Raises UserError for an unknown graph, a bad edge, or a graph that is not connected.
+    """
+    i = np.arange(n)
+    gap = np.abs(i[:, None] - i[None, :])
+    if graph == "complete" or disk_radius(graph) is not None:
+        return gap > 0
+    if graph == "path":
+        return gap == 1
+    if graph == "ring":
+        return (gap == 1) | ((gap == n - 1) & (gap > 0))
+    if graph == "star":
+        return (gap > 0) & ((i[:, None] == 0) | (i[None, :] == 0))
+    edges = _edges(graph, n)
+    linked = np.zeros((n, n), bool)
+    for a, b in edges:
+        linked[a, b] = linked[b, a] = True
+    apart = np.flatnonzero(hops(linked, (0,)) < 0)
+    if apart.size:
+        raise UserError(
+            f"graph: '{graph}' is not connected (no path from agent 0 to agent {apart[0]}); "
+            "add an edge that joins them."
+        )
+    return linked
+
+
+def disk_radius(graph: str) -> float | None:
+    """The radius R (m) of `disk:R`, None for every other graph."""
+    if not graph.startswith("disk:"):
+        return None
+    try:
+        radius = float(graph[5:])
+    except ValueError:
+        radius = -1.0
+    if not 0 < radius < np.inf:
+        raise UserError(f"graph: '{graph}' needs a positive radius in metres, as in disk:0.8.")
+    return radius
+
+
+def neighbours(linked: Bool[np.ndarray, "agent agent"]) -> Int[np.ndarray, "agent slot"]:
+    """The neighbours of each agent in ascending order, padded with -1 to the largest degree."""
+    rows = [np.flatnonzero(row) for row in linked]
+    table = np.full((len(rows), max((len(r) for r in rows), default=0)), -1)
+    for i, row in enumerate(rows):
+        table[i, : len(row)] = row
+    return table
+
+
+def hops(
+    linked: Bool[np.ndarray, "agent agent"], leaders: tuple[int, ...]
+) -> Int[np.ndarray, "agent"]:
+    """Edges from each agent to its nearest leader, -1 where there is no path."""
+    distance = np.full(len(linked), -1)
+    frontier = np.unique(np.array(leaders, int))
+    step = 0
+    while frontier.size:
+        distance[frontier] = step
+        step += 1
+        frontier = np.flatnonzero(linked[frontier].any(0) & (distance < 0))
+    return distance
+
+
+def _edges(graph: str, n: int) -> list[tuple[int, int]]:
+    pairs = [re.fullmatch(r"\s*(\d{1,6})\s*-\s*(\d{1,6})\s*", e) for e in graph.split(",")]
+    if not graph or any(p is None for p in pairs):
+        raise UserError(
+            f"graph: '{graph}' is none of {', '.join(NAMED)}, disk:RADIUS "
+            "or an edge list such as 0-1,1-2."
+        )
+    edges = [(int(p[1]), int(p[2])) for p in pairs if p]
+    for a, b in edges:
+        if a == b or max(a, b) >= n:
+            raise UserError(
+                f"graph: edge {a}-{b} must join two different agents among 0 to {n - 1}."
+            )
+    return edges

@@ -1,0 +1,61 @@
+"""How a batch lies in memory when a network written for one sample is vmapped.
+
+Left to itself, vmap puts the batch first wherever it likes, and XLA then copies activations to
+turn them round between layers. Here a vmapped input becomes the last axis, so that activations
+are [features, batch] forwards and backwards, and each layer is one matrix product for its value,
+one for the gradient of its input and one for the gradient of its weights.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Float, PyTree
+
+
+Forward = Callable[[Any, PyTree], PyTree]  # (net, x) with every array of x [*stack, in, batch]
+
+
+def batch_last(forward: Forward) -> Forward:
+    """Give `forward(net, x)`, written for arrays of shape [*stack, in, batch], its rule under vmap.
+
+    Weights and x both batched: one more axis of stacked nets (agents, seeds). Weights alone:
+    stacked nets that look at the same x (twins). x alone: the batch, which becomes columns; reverse
+    differentiation goes through this case only, so `vmap` an objective before taking its gradient.
+    """
+    rule = custom_vmap(forward)
+
+    @rule.def_vmap
+    def _(size: int, batched: list[PyTree], net: Any, x: PyTree) -> tuple[PyTree, PyTree]:
+        if any(jax.tree.leaves(batched[0])):
+            y = rule(net, x)
+        else:
+            columns = lambda a: jnp.moveaxis(a, 0, -1).reshape(*a.shape[1:-1], -1)
+            rows = lambda a: jnp.moveaxis(a.reshape(*a.shape[:-1], -1, size), -1, 0)
+            y = jax.tree.map(rows, forward(net, jax.tree.map(columns, x)))
+        return y, jax.tree.map(lambda _: True, y)
+
+    return rule
+
+
+@jax.custom_vjp
+def matmul(W: Float[Array, "*stack out in"], x: Array) -> Array:
+    """W @ x for x of shape [*stack, in, batch], or without the last stack axis if all share x."""
+    if W.ndim == x.ndim:
+        return W @ x
+    tall = W.reshape(*W.shape[:-3], -1, W.shape[-1])
+    return (tall @ x).reshape(*W.shape[:-1], -1)
+
+
+def _backward(residual: tuple[Array, Array], g: Array) -> tuple[Array, Array]:
+    W, x = residual
+    if W.ndim == x.ndim:
+        return g @ jnp.swapaxes(x, -1, -2), jnp.swapaxes(W, -1, -2) @ g
+    tall_W, tall_g = (a.reshape(*a.shape[:-3], -1, a.shape[-1]) for a in (W, g))
+    gradient_W = (tall_g @ jnp.swapaxes(x, -1, -2)).reshape(W.shape)
+    return gradient_W, jnp.swapaxes(tall_W, -1, -2) @ tall_g
+
+
+matmul.defvjp(lambda W, x: (matmul(W, x), (W, x)), _backward)

@@ -1,0 +1,167 @@
+"""The function approximators pi_phi, Q_theta and L_psi, each written for one sample."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from marlyap.layout import batch_last, matmul
+from marlyap.types import Action, Features, Key, Obs, Scalar
+
+
+class Shape(NamedTuple):
+    """All that a learning rule may know of a game before it has seen a transition."""
+
+    agents: int
+    obs: int
+    features: int
+    errors: int  # how many leading features are zero exactly on the target set
+    du: int
+
+
+class Layer(eqx.Module):
+    """x -> W x + b, initialised uniformly in +- 1/sqrt(in); then LayerNorm's gain and offset."""
+
+    weight: Float[Array, "out in"]
+    bias: Float[Array, "out"]
+    norm: tuple[Float[Array, "out"], Float[Array, "out"]] | None
+
+    def __init__(self, size_in: int, size_out: int, normalise: bool, *, key: Key):
+        k_weight, k_bias = jax.random.split(key)
+        draw = lambda k, shape: jax.random.uniform(k, shape, minval=-1.0, maxval=1.0)
+        self.weight = draw(k_weight, (size_out, size_in)) / size_in**0.5
+        self.bias = draw(k_bias, (size_out,)) / size_in**0.5
+        self.norm = (jnp.ones(size_out), jnp.zeros(size_out)) if normalise else None
+
+    def __call__(self, x: Float[Array, "*stack in batch"]) -> Float[Array, "*stack out batch"]:
+        if self.norm is None:
+            return matmul(self.weight, x) + self.bias[..., None]
+        # The mean over outputs that LayerNorm subtracts is linear in W and b: take it there.
+        centred = lambda a, axis: a - jnp.mean(a, axis=axis, keepdims=True)
+        y = matmul(centred(self.weight, -2), x) + centred(self.bias, -1)[..., None]
+        scale = jax.lax.rsqrt(jnp.mean(y * y, axis=-2, keepdims=True) + 1e-5)
+        gain, offset = self.norm
+        return y * scale * gain[..., None] + offset[..., None]
+
+
+class MLP(eqx.Module):
+    """ReLU layers, with LayerNorm before each ReLU where asked; linear at the end."""
+
+    layers: tuple[Layer, ...]
+
+    def __init__(self, sizes: tuple[int, ...], normalise: bool = False, *, key: Key):
+        keys = jax.random.split(key, len(sizes) - 1)
+        last = len(sizes) - 2
+        self.layers = tuple(
+            Layer(sizes[i], sizes[i + 1], normalise and i < last, key=k)
+            for i, k in enumerate(keys)
+        )
+
+    def __call__(self, x: Float[Array, "in"]) -> Float[Array, "out"]:
+        return _apply(self, x[:, None])[:, 0]
+
+
+def _forward(net: MLP, x: Float[Array, "*stack in batch"]) -> Float[Array, "*stack out batch"]:
+    for layer in net.layers[:-1]:
+        x = jax.nn.relu(layer(x))
+    return net.layers[-1](x)
+
+
+_apply = batch_last(_forward)
+
+
+class Sample(NamedTuple):
+    """a ~ pi(. | o) and log pi_i(a_i | o_i) of each agent."""
+
+    action: Action
+    log_prob: Float[Array, "agent"]
+
+
+class Actors(eqx.Module):
+    """pi_phi = {pi_phi_1, ..., pi_phi_N}: a Gaussian squashed by tanh for every agent.
+
+    Agent i's action is made of row i of the observations alone.
+    """
+
+    net: MLP  # leaves have a leading axis `agent`, unless shared
+    shared: bool
+    du: int
+
+    def __init__(self, shape: Shape, width: int, shared: bool = False, *, key: Key):
+        make = lambda k: MLP((shape.obs, width, width, 2 * shape.du), key=k)
+        self.net = make(key) if shared else eqx.filter_vmap(make)(jax.random.split(key, shape.agents))
+        self.shared = shared
+        self.du = shape.du
+
+    def sample(self, obs: Obs, noise: Action) -> Sample:
+        """Reparametrised: tanh(mean + std * noise) for standard normal noise."""
+        per_agent = eqx.filter_vmap(_squashed, in_axes=(None if self.shared else 0, 0))
+        action, log_prob = per_agent(self.net, (obs[..., None], noise[..., None]))
+        return Sample(action[..., 0], log_prob[..., 0, 0])
+
+    def mode(self, obs: Obs) -> Action:
+        """The deterministic policy that is evaluated, certified and deployed."""
+        per_agent = eqx.filter_vmap(lambda net, o: net(o), in_axes=(None if self.shared else 0, 0))
+        return jnp.tanh(jnp.split(per_agent(self.net, obs), 2, axis=-1)[0])
+
+
+@batch_last
+def _squashed(
+    net: MLP, x: tuple[Float[Array, "*stack obs batch"], Float[Array, "*stack du batch"]]
+) -> tuple[Float[Array, "*stack du batch"], Float[Array, "*stack 1 batch"]]:
+    obs, noise = x
+    mean, log_std = jnp.split(_forward(net, obs), 2, axis=-2)
+    log_std = jnp.clip(log_std, -5.0, 2.0)
+    u = mean + jnp.exp(log_std) * noise
+    log_normal = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
+    log_squash = 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))  # log(1 - tanh(u)^2)
+    return jnp.tanh(u), jnp.sum(log_normal - log_squash, axis=-2, keepdims=True)
+
+
+class Sampled(eqx.Module):
+    """The policy that explores."""
+
+    pi: Actors
+
+    def __call__(self, obs: Obs, key: Key) -> Action:
+        return self.pi.sample(obs, jax.random.normal(key, (obs.shape[0], self.pi.du))).action
+
+
+class Greedy(eqx.Module):
+    """The policy that is deployed."""
+
+    pi: Actors
+
+    def __call__(self, obs: Obs, key: Key) -> Action:
+        return self.pi.mode(obs)
+
+
+class Critic(eqx.Module):
+    """Q_theta^1 and Q_theta^2 of (s, a): central, twin; one value for the team or one an agent."""
+
+    nets: MLP  # leaves have a leading axis of 2
+
+    def __init__(self, shape: Shape, width: int, heads: int, normalise: bool, *, key: Key):
+        size = shape.agents * (shape.features + shape.du)
+        make = lambda k: MLP((size, width, width, heads), normalise, key=k)
+        self.nets = eqx.filter_vmap(make)(jax.random.split(key, 2))
+
+    def __call__(self, features: Features, action: Action) -> Float[Array, "twin head"]:
+        x = jnp.concatenate([features.ravel(), action.ravel()])
+        return eqx.filter_vmap(lambda net: net(x))(self.nets)
+
+
+class LyapunovNet(eqx.Module):
+    """L_psi(s, a) >= 0: hidden layers 64, 64 and 16 (section 4); the squares of the last sum to L."""
+
+    net: MLP
+
+    def __init__(self, shape: Shape, normalise: bool = False, *, key: Key):
+        size = shape.agents * (shape.features + shape.du)
+        self.net = MLP((size, 64, 64, 16), normalise, key=key)
+
+    def __call__(self, features: Features, action: Action) -> Scalar:
+        out = self.net(jnp.concatenate([features.ravel(), action.ravel()]))
+        return jnp.sum(jax.nn.relu(out) ** 2)

@@ -1,0 +1,89 @@
+"""The replay memory D: a ring of episodes, itself a pytree.
+
+Whole episodes are kept because next_obs of one step is obs of the following one (half the
+memory), and because n-step returns need the steps that follow.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from marlyap.types import Key, Transition
+
+
+class Episode(eqx.Module):
+    """What is remembered of one episode."""
+
+    obs: Float[Array, "time+1 agent obs"]
+    features: Float[Array, "time+1 agent feature"]
+    action: Float[Array, "time agent du"]
+    reward: Float[Array, "time agent"]
+    cost: Float[Array, "time agent"]
+    cost_to_go: Float[Array, "time agent"]
+    cost_ahead: Float[Array, "time agent"]
+    terminated: Bool[Array, "time"]
+
+
+class Replay(eqx.Module):
+    """The last `rows` episodes."""
+
+    episodes: Episode  # every leaf has a leading axis `rows`
+    head: Int[Array, ""]  # where the next episode goes
+    size: Int[Array, ""]  # how many rows are filled
+
+    @classmethod
+    def empty(cls, example: Episode, rows: int) -> "Replay":
+        """Room for `rows` episodes shaped like `example`."""
+        zeros = jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), example)
+        return cls(zeros, jnp.asarray(0), jnp.asarray(0))
+
+    @property
+    def rows(self) -> int:
+        return self.episodes.reward.shape[0]
+
+    @property
+    def time(self) -> int:
+        return self.episodes.reward.shape[1]
+
+    def add(self, new: Episode) -> "Replay":
+        """D <- D + new (leading axis: episodes); the oldest are overwritten."""
+        count = new.reward.shape[0]
+        at = (self.head + jnp.arange(count)) % self.rows
+        episodes = jax.tree.map(lambda d, x: d.at[at].set(x), self.episodes, new)
+        size = jnp.minimum(self.size + count, self.rows)
+        return Replay(episodes, (self.head + count) % self.rows, size)
+
+    def sample(self, key: Key, batch: int, gamma: float, n: int = 1) -> Transition:
+        """B ~ D: `batch` transitions with n-step rewards, each step equally likely."""
+        k_row, k_time = jax.random.split(key)
+        row = jax.random.randint(k_row, (batch,), 0, self.size)
+        t = jax.random.randint(k_time, (batch,), 0, self.time)
+        return jax.vmap(lambda row, t: self.transition(row, t, gamma, n))(row, t)
+
+    def transition(
+        self, row: Int[Array, ""], t: Int[Array, ""], gamma: float, n: int = 1
+    ) -> Transition:
+        """The step t of one episode; fewer than n steps are summed where the episode is cut.
+
+        The cut at the time limit does not zero `discount`; termination does.
+        """
+        e = self.episodes
+        k = jnp.arange(n)
+        steps = jnp.minimum(n, self.time - t)
+        at = jnp.minimum(t + k, self.time - 1)
+        ended = e.terminated[row, at] & (k < steps)
+        alive = jnp.cumprod(1.0 - ended)  # after step k
+        weight = jnp.where(k < steps, gamma**k, 0.0) * jnp.concatenate([jnp.ones(1), alive[:-1]])
+        return Transition(
+            obs=e.obs[row, t],
+            features=e.features[row, t],
+            action=e.action[row, t],
+            reward=weight @ e.reward[row, at],
+            cost=e.cost[row, t],
+            next_obs=e.obs[row, t + steps],
+            next_features=e.features[row, t + steps],
+            discount=gamma**steps * alive[-1],
+            cost_to_go=e.cost_to_go[row, t],
+            cost_ahead=e.cost_ahead[row, t],
+        )

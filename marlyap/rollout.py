@@ -1,0 +1,66 @@
+"""One rollout serves training, evaluation, certificates and pictures."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from marlyap.game import AbstractGame
+from marlyap.types import Action, Key, Obs, State, Trajectory
+
+
+Controller = Callable[[State, Key], Action]  # may see everything
+Policy = Callable[[Obs, Key], Action]  # row i of the action comes from row i of obs alone
+
+
+class Decentralised(eqx.Module):
+    """A policy as a controller: it is shown each agent's own observation and nothing else.
+
+    A module, not a closure, so that jit sees the weights as arguments and compiles once.
+    """
+
+    policy: Policy
+    game: AbstractGame
+
+    def __call__(self, state: State, key: Key) -> Action:
+        return self.policy(self.game.observe(state), key)
+
+
+def rollout(
+    game: AbstractGame, controller: Controller, start: State, key: Key, steps: int | None = None
+) -> Trajectory:
+    """Drive the game from `start` for `steps` steps (default: its horizon).
+
+    Once the game has terminated its state stands still.
+    """
+
+    def tick(state, key):
+        action = controller(state, key)
+        moved = game.step(state, action)
+        ended = game.terminated(state)
+        after = jax.tree.map(lambda old, new: jnp.where(ended, old, new), state, moved)
+        reward, cost = game.rewards(state, action), game.costs(state, action)
+        return after, (after, action, reward, cost, game.terminated(after))
+
+    keys = jax.random.split(key, steps or game.horizon)
+    _, (after, action, reward, cost, terminated) = jax.lax.scan(tick, start, keys)
+    states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, after)
+    return Trajectory(
+        action=action, reward=reward, cost=cost, state=states, terminated=terminated
+    )
+
+
+def cost_to_go(
+    cost: Float[Array, "long agent"], T: int, time: int
+) -> tuple[Float[Array, "time agent"], Float[Array, "time agent"]]:
+    """L_target(t) = sum_{k<T} c_{t+k} and c_{t+T}, for the first `time` steps.
+
+    Costs past the end of `cost` are taken to stay what they were last; dropping them would
+    teach L to fall with the clock. Roll the game T steps further to have the true ones.
+    """
+    missing = max(0, time + T - cost.shape[0])
+    padded = jnp.concatenate([cost, jnp.repeat(cost[-1:], missing, axis=0)])
+    window = jnp.arange(time)[:, None] + jnp.arange(T)[None, :]
+    return jnp.sum(padded[window], axis=1), padded[T : time + T]

@@ -1,0 +1,60 @@
+"""What an agent sees: everything in its own frame, so that neither compass nor map is needed.
+
+A turn or a shift of the whole scene changes nothing (SE(2) invariance), and nothing but the
+agent itself and its neighbours enters (locality).
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from marlyap.dynamics import AbstractDynamics
+from marlyap.types import Obs, State
+
+
+def into_frame(h: Float[Array, "2"], v: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
+    """World vectors in the frame whose first axis is the unit vector h: R(-psi) v."""
+    along = v[..., 0] * h[0] + v[..., 1] * h[1]
+    left = v[..., 1] * h[0] - v[..., 0] * h[1]
+    return jnp.stack([along, left], axis=-1)
+
+
+def body_frame(
+    dynamics: AbstractDynamics,
+    state: State,
+    slots: Int[Array, "agent slot"],
+    linked: Bool[Array, "agent agent"],
+    leads: Bool[Array, "agent"],
+    headings: bool,
+) -> Obs:
+    """Per agent: own rates; leader flag and goal - p_i (0 for a follower); for every neighbour slot
+    a presence flag, p_j - p_i, the velocity of j, and, if asked, the heading of j.
+
+    Empty slots are all zero.
+    """
+    p = jax.vmap(dynamics.position)(state.x)
+    h = jax.vmap(dynamics.heading)(state.x)
+    v = jax.vmap(dynamics.velocity)(state.x)
+    rates = jax.vmap(dynamics.rates)(state.x)
+
+    def of(i, slot, lead):
+        there = (slot >= 0) & linked[i, slot]
+        seen = [into_frame(h[i], p[slot] - p[i]), into_frame(h[i], v[slot])]
+        if headings:
+            seen.append(into_frame(h[i], h[slot]))
+        flag = there.astype(p.dtype)[:, None]
+        others = jnp.where(there[:, None], jnp.concatenate([flag, *seen], axis=1), 0.0)
+        to_goal = jnp.where(lead, into_frame(h[i], state.goal[i] - p[i]), 0.0)
+        return jnp.concatenate([rates[i], lead.astype(p.dtype)[None], to_goal, others.ravel()])
+
+    return jax.vmap(of)(jnp.arange(slots.shape[0]), slots, leads)
+
+
+def goal_errors(dynamics: AbstractDynamics, state: State) -> Float[Array, "agent error"]:
+    """Per agent: goal - p_i in its own frame and its rates; all zero exactly on the target set."""
+
+    def of(x, goal):
+        to_goal = into_frame(dynamics.heading(x), goal - dynamics.position(x))
+        return jnp.concatenate([to_goal, dynamics.rates(x)])
+
+    return jax.vmap(of)(state.x, state.goal)

@@ -1,0 +1,134 @@
+"""The outer loop of Algorithms 1 and 2: play, remember, learn; compiled, one iteration at a time."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int, PyTree
+
+from marlyap.algorithm import AbstractAlgorithm
+from marlyap.errors import UserError
+from marlyap.game import AbstractGame
+from marlyap.nets import Shape
+from marlyap.replay import Episode, Replay
+from marlyap.rollout import Decentralised, cost_to_go, rollout
+from marlyap.types import Action, Key, Obs, Scalar
+
+
+class Schedule(eqx.Module):
+    """How much is played and learnt. An iteration plays `environments` episodes, then updates."""
+
+    steps: int = 614_400  # environment steps in all
+    environments: int = 64  # episodes played side by side in an iteration
+    steps_per_update: int = 8  # environment steps for one gradient step
+    warmup: int = 2_560  # environment steps of uniformly random actions before learning
+    capacity: int = 1_024_000  # environment steps that the replay memory holds
+    decay: float = 0.1  # learning rates are multiplied by this ...
+    decay_episodes: int | None = None  # ... every so many episodes (None: over the whole run)
+
+
+class Carry(eqx.Module):
+    """All that training is at one instant; saved whole, so that a resumed run is the same run."""
+
+    learner: PyTree
+    memory: Replay
+    key: Key
+    iteration: Int[Array, ""]
+
+
+class Uniform(eqx.Module):
+    """Random actions, for the warm-up."""
+
+    agents: int
+    du: int
+
+    def __call__(self, obs: Obs, key: Key) -> Action:
+        return jax.random.uniform(key, (self.agents, self.du), minval=-1.0, maxval=1.0)
+
+
+def shape(game: AbstractGame) -> Shape:
+    """What the algorithm may know of the game."""
+    look = lambda key: (lambda s: (game.observe(s), game.features(s), game.errors(s)))(game.reset(key))
+    obs, features, errors = eqx.filter_eval_shape(look, jax.random.key(0))
+    return Shape(game.agents, obs.shape[1], features.shape[1], errors.shape[1], game.dynamics.du)
+
+
+class Trainer(eqx.Module):
+    """One training run as two pure functions, `begin` and `iterate`."""
+
+    game: AbstractGame
+    algorithm: AbstractAlgorithm
+    schedule: Schedule
+
+    @property
+    def steps_per_iteration(self) -> int:
+        return self.schedule.environments * self.game.horizon
+
+    @property
+    def iterations(self) -> int:
+        return -(-self.schedule.steps // self.steps_per_iteration)
+
+    @property
+    def updates_per_iteration(self) -> int:
+        return max(1, self.steps_per_iteration // self.schedule.steps_per_update)
+
+    def begin(self, key: Key) -> Carry:
+        """A fresh learner, and a memory with the warm-up in it."""
+        k_init, k_warm, key = jax.random.split(key, 3)
+        s, random = self.schedule, Uniform(self.game.agents, self.game.dynamics.du)
+        learner = self.algorithm.init(shape(self.game), k_init)
+        episodes = max(1, -(-s.warmup // self.game.horizon))
+        warm = self.play(random, k_warm, episodes)
+        rows = max(s.capacity // self.game.horizon, episodes, s.environments)
+        memory = Replay.empty(jax.tree.map(lambda x: x[0], warm), rows).add(warm)
+        return Carry(learner, memory, key, jnp.asarray(0))
+
+    def iterate(self, carry: Carry) -> tuple[Carry, dict[str, Scalar]]:
+        """Play, remember, learn; the dict is for the log."""
+        key, k_play, k_learn = jax.random.split(carry.key, 3)
+        new = self.play(self.algorithm.explore(carry.learner), k_play, self.schedule.environments)
+        memory = carry.memory.add(new)
+        decay = self.decay(carry.iteration)
+        dynamic, static = eqx.partition(carry.learner, eqx.is_array)
+
+        def learn(dynamic, key):
+            k_sample, k_update = jax.random.split(key)
+            a = self.algorithm
+            batch = memory.sample(k_sample, a.batch, a.gamma, a.n_step)
+            learner, info = a.update(eqx.combine(dynamic, static), batch, k_update, decay)
+            return eqx.filter(learner, eqx.is_array), info
+
+        keys = jax.random.split(k_learn, self.updates_per_iteration)
+        dynamic, info = jax.lax.scan(learn, dynamic, keys)
+        info = jax.tree.map(jnp.mean, info)
+        info["return"] = jnp.mean(jnp.sum(jnp.mean(new.reward, axis=2), axis=1))
+        return Carry(eqx.combine(dynamic, static), memory, key, carry.iteration + 1), info
+
+    def play(self, policy, key: Key, episodes: int) -> Episode:
+        """`episodes` fresh episodes, as the memory keeps them."""
+        game = self.game
+        T, further = self.algorithm.foresight
+        controller = Decentralised(policy, game)
+
+        def one(key):
+            k_start, k_act = jax.random.split(key)
+            long = rollout(game, controller, game.reset(k_start), k_act, game.horizon + further * T)
+            state = jax.tree.map(lambda x: x[: game.horizon + 1], long.state)
+            to_go, ahead = cost_to_go(long.cost, T, game.horizon)
+            return Episode(
+                obs=jax.vmap(game.observe)(state),
+                features=jax.vmap(game.features)(state),
+                action=long.action[: game.horizon],
+                reward=long.reward[: game.horizon],
+                cost=long.cost[: game.horizon],
+                cost_to_go=to_go,
+                cost_ahead=ahead,
+                terminated=long.terminated[: game.horizon],
+            )
+
+        return jax.vmap(one)(jax.random.split(key, episodes))
+
+    def decay(self, iteration: Int[Array, ""]) -> Scalar:
+        """What the learning rates are multiplied by."""
+        s = self.schedule
+        span = s.decay_episodes or self.iterations * s.environments
+        return s.decay ** (iteration * s.environments / span)
