@@ -729,6 +729,20 @@ def test_a_replacement_cut_in_two_is_read_and_put_back(tmp_path):
     assert store.read(checkpoints.path(2), "checkpoint")[1] == {"step": 2}
 
 
+def test_a_directory_between_two_renames_is_looked_for_again(stored, monkeypatch):
+    losses, system_open = [stored] * 3, os.open
+
+    def unlucky(path, *arguments, **options):
+        if path in losses:
+            losses.remove(path)
+            raise FileNotFoundError(errno.ENOENT, "No such file or directory")
+        return system_open(path, *arguments, **options)
+
+    monkeypatch.setattr(os, "open", unlucky)
+    assert_same(store.read(stored, "policy")[0], sample())
+    assert not losses
+
+
 def test_a_replacement_cut_in_two_may_be_damaged_as_well(stored):
     damage(stored)
     os.rename(stored, stored.parent / f".policy.{dead_pid()}-00000000-00000000.old")
@@ -1162,6 +1176,8 @@ def test_json_files_that_cannot_be_read(tmp_path):
         with pytest.raises(CorruptError, match=str(tmp_path)) as caught:
             store.read_json(tmp_path / name, 100)
         sentence(caught)
+    with pytest.raises(CorruptError, match="pipe is not a file"):
+        store.read_jsonl(tmp_path / "pipe")
 
 
 @fuzz
