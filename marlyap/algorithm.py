@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import PyTree
 
 from marlyap.nets import Shape
-from marlyap.rollout import Policy
+from marlyap.rollout import AbstractExplorer, Policy
 from marlyap.types import Key, Scalar, Transition
 
 
@@ -33,7 +33,7 @@ class AbstractAlgorithm(eqx.Module):
         """One gradient step on a batch, its rates multiplied by `decay`; the dict is for the log."""
 
     @abc.abstractmethod
-    def explore(self, learner: PyTree) -> Policy:
+    def explore(self, learner: PyTree) -> AbstractExplorer:
         """The policy that collects data."""
 
     @abc.abstractmethod

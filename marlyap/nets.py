@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from marlyap.layout import batch_last, matmul
+from marlyap.rollout import AbstractExplorer
 from marlyap.types import Action, Features, Key, Obs, Scalar
 
 
@@ -73,10 +74,11 @@ _apply = batch_last(_forward)
 
 
 class Sample(NamedTuple):
-    """a ~ pi(. | o) and log pi_i(a_i | o_i) of each agent."""
+    """a ~ pi(. | o), log pi_i(a_i | o_i), and the same for the action in the memory."""
 
     action: Action
     log_prob: Float[Array, "agent"]
+    log_prob_memory: Float[Array, "agent"]
 
 
 class Actors(eqx.Module):
@@ -91,15 +93,17 @@ class Actors(eqx.Module):
 
     def __init__(self, shape: Shape, width: int, shared: bool = False, *, key: Key):
         make = lambda k: MLP((shape.obs, width, width, 2 * shape.du), key=k)
-        self.net = make(key) if shared else eqx.filter_vmap(make)(jax.random.split(key, shape.agents))
+        several = lambda: eqx.filter_vmap(make)(jax.random.split(key, shape.agents))
+        self.net = make(key) if shared else several()
         self.shared = shared
         self.du = shape.du
 
-    def sample(self, obs: Obs, noise: Action) -> Sample:
-        """Reparametrised: tanh(mean + std * noise) for standard normal noise."""
+    def sample(self, obs: Obs, noise: Action, memory: Action) -> Sample:
+        """tanh(mean + std * noise) for standard normal noise: reparametrised."""
         per_agent = eqx.filter_vmap(_squashed, in_axes=(None if self.shared else 0, 0))
-        action, log_prob = per_agent(self.net, (obs[..., None], noise[..., None]))
-        return Sample(action[..., 0], log_prob[..., 0, 0])
+        column = lambda x: x[..., None]
+        out = per_agent(self.net, (column(obs), column(noise), column(memory)))
+        return Sample(out[0][..., 0], out[1][..., 0, 0], out[2][..., 0, 0])
 
     def mode(self, obs: Obs) -> Action:
         """The deterministic policy that is evaluated, certified and deployed."""
@@ -108,25 +112,33 @@ class Actors(eqx.Module):
 
 
 @batch_last
-def _squashed(
-    net: MLP, x: tuple[Float[Array, "*stack obs batch"], Float[Array, "*stack du batch"]]
-) -> tuple[Float[Array, "*stack du batch"], Float[Array, "*stack 1 batch"]]:
-    obs, noise = x
+def _squashed(net: MLP, x: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    """(obs, noise, memory) [*stack, ., batch] -> (action, log pi of it, log pi of memory)."""
+    obs, noise, memory = x
     mean, log_std = jnp.split(_forward(net, obs), 2, axis=-2)
     log_std = jnp.clip(log_std, -5.0, 2.0)
+
+    def log_prob(u, z):
+        log_normal = -0.5 * z**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
+        log_squash = 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))  # log(1 - tanh(u)^2)
+        return jnp.sum(log_normal - log_squash, axis=-2, keepdims=True)
+
     u = mean + jnp.exp(log_std) * noise
-    log_normal = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
-    log_squash = 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))  # log(1 - tanh(u)^2)
-    return jnp.tanh(u), jnp.sum(log_normal - log_squash, axis=-2, keepdims=True)
+    past = jnp.arctanh(jnp.clip(memory, -1 + 1e-6, 1 - 1e-6))
+    return jnp.tanh(u), log_prob(u, noise), log_prob(past, (past - mean) * jnp.exp(-log_std))
 
 
-class Sampled(eqx.Module):
+class Sampled(AbstractExplorer):
     """The policy that explores."""
 
     pi: Actors
 
     def __call__(self, obs: Obs, key: Key) -> Action:
-        return self.pi.sample(obs, jax.random.normal(key, (obs.shape[0], self.pi.du))).action
+        noise = jax.random.normal(key, (obs.shape[0], self.pi.du))
+        return self.pi.sample(obs, noise, noise).action
+
+    def log_prob(self, obs: Obs, action: Action) -> Float[Array, "agent"]:
+        return self.pi.sample(obs, action, action).log_prob_memory
 
 
 class Greedy(eqx.Module):
@@ -165,3 +177,36 @@ class LyapunovNet(eqx.Module):
     def __call__(self, features: Features, action: Action) -> Scalar:
         out = self.net(jnp.concatenate([features.ravel(), action.ravel()]))
         return jnp.sum(jax.nn.relu(out) ** 2)
+
+
+class NormNet(eqx.Module):
+    """V(s) = ||Phi(e) - Phi(0)|| + slope ||e||, where e is zero exactly on the target set.
+
+    So V is 0 on the target set, positive elsewhere whatever the weights, and its Lipschitz
+    constant in e is at most the product of the layers' spectral norms plus `slope`.
+    """
+
+    net: MLP
+    errors: int  # how many leading features make up e
+    slope: float = 0.1
+
+    def __init__(self, shape: Shape, normalise: bool = False, *, key: Key):
+        self.net = MLP((shape.agents * shape.errors, 64, 64, 16), normalise, key=key)
+        self.errors = shape.errors
+
+    def __call__(self, features: Features, action: Action | None = None) -> Scalar:
+        e = features[:, : self.errors].ravel()
+        at_zero = _forward(self.net, jnp.zeros((e.shape[0], 1)))[:, 0]  # one for the whole batch
+        change = self.net(e) - at_zero
+        return _norm(change) + self.slope * _norm(e)
+
+    def lipschitz(self) -> Scalar:
+        """An upper bound on |V(s) - V(s')| / ||e - e'||."""
+        norms = [jnp.linalg.norm(layer.weight, ord=2) for layer in self.net.layers]
+        return jnp.prod(jnp.stack(norms)) + self.slope
+
+
+def _norm(x: Float[Array, "n"]) -> Scalar:
+    """||x||, with a gradient of 0 at 0."""
+    square = jnp.sum(x * x)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)

@@ -18,6 +18,7 @@ class Episode(eqx.Module):
     obs: Float[Array, "time+1 agent obs"]
     features: Float[Array, "time+1 agent feature"]
     action: Float[Array, "time agent du"]
+    log_prob: Float[Array, "time agent"]
     reward: Float[Array, "time agent"]
     cost: Float[Array, "time agent"]
     cost_to_go: Float[Array, "time agent"]
@@ -79,6 +80,7 @@ class Replay(eqx.Module):
             obs=e.obs[row, t],
             features=e.features[row, t],
             action=e.action[row, t],
+            log_prob=e.log_prob[row, t],
             reward=weight @ e.reward[row, at],
             cost=e.cost[row, t],
             next_obs=e.obs[row, t + steps],

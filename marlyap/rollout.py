@@ -1,5 +1,6 @@
 """One rollout serves training, evaluation, certificates and pictures."""
 
+import abc
 from collections.abc import Callable
 
 import equinox as eqx
@@ -13,6 +14,30 @@ from marlyap.types import Action, Key, Obs, State, Trajectory
 
 Controller = Callable[[State, Key], Action]  # may see everything
 Policy = Callable[[Obs, Key], Action]  # row i of the action comes from row i of obs alone
+
+
+class AbstractExplorer(eqx.Module):
+    """A policy that collects data, and says how likely its actions were."""
+
+    @abc.abstractmethod
+    def __call__(self, obs: Obs, key: Key) -> Action:
+        """Row i of the action comes from row i of obs alone."""
+
+    @abc.abstractmethod
+    def log_prob(self, obs: Obs, action: Action) -> Float[Array, "agent"]:
+        """log pi_i(a_i | o_i)."""
+
+
+class Uniform(AbstractExplorer):
+    """Uniformly random actions in [-1, 1], for the warm-up."""
+
+    du: int
+
+    def __call__(self, obs, key):
+        return jax.random.uniform(key, (obs.shape[0], self.du), minval=-1.0, maxval=1.0)
+
+    def log_prob(self, obs, action):
+        return jnp.full(obs.shape[0], -self.du * jnp.log(2.0))
 
 
 class Decentralised(eqx.Module):

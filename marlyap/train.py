@@ -10,8 +10,8 @@ from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.nets import Shape
 from marlyap.replay import Episode, Replay
-from marlyap.rollout import Decentralised, cost_to_go, rollout
-from marlyap.types import Action, Key, Obs, Scalar
+from marlyap.rollout import AbstractExplorer, Decentralised, Uniform, cost_to_go, rollout
+from marlyap.types import Key, Scalar
 
 
 class Schedule(eqx.Module):
@@ -33,16 +33,6 @@ class Carry(eqx.Module):
     memory: Replay
     key: Key
     iteration: Int[Array, ""]
-
-
-class Uniform(eqx.Module):
-    """Random actions, for the warm-up."""
-
-    agents: int
-    du: int
-
-    def __call__(self, obs: Obs, key: Key) -> Action:
-        return jax.random.uniform(key, (self.agents, self.du), minval=-1.0, maxval=1.0)
 
 
 def shape(game: AbstractGame) -> Shape:
@@ -74,7 +64,7 @@ class Trainer(eqx.Module):
     def begin(self, key: Key) -> Carry:
         """A fresh learner, and a memory with the warm-up in it."""
         k_init, k_warm, key = jax.random.split(key, 3)
-        s, random = self.schedule, Uniform(self.game.agents, self.game.dynamics.du)
+        s, random = self.schedule, Uniform(self.game.dynamics.du)
         learner = self.algorithm.init(shape(self.game), k_init)
         episodes = max(1, -(-s.warmup // self.game.horizon))
         warm = self.play(random, k_warm, episodes)
@@ -103,7 +93,7 @@ class Trainer(eqx.Module):
         info["return"] = jnp.mean(jnp.sum(jnp.mean(new.reward, axis=2), axis=1))
         return Carry(eqx.combine(dynamic, static), memory, key, carry.iteration + 1), info
 
-    def play(self, policy, key: Key, episodes: int) -> Episode:
+    def play(self, policy: AbstractExplorer, key: Key, episodes: int) -> Episode:
         """`episodes` fresh episodes, as the memory keeps them."""
         game = self.game
         T, further = self.algorithm.foresight
@@ -114,10 +104,13 @@ class Trainer(eqx.Module):
             long = rollout(game, controller, game.reset(k_start), k_act, game.horizon + further * T)
             state = jax.tree.map(lambda x: x[: game.horizon + 1], long.state)
             to_go, ahead = cost_to_go(long.cost, T, game.horizon)
+            obs = jax.vmap(game.observe)(state)
+            action = long.action[: game.horizon]
             return Episode(
-                obs=jax.vmap(game.observe)(state),
+                obs=obs,
                 features=jax.vmap(game.features)(state),
-                action=long.action[: game.horizon],
+                action=action,
+                log_prob=jax.vmap(policy.log_prob)(obs[:-1], action),
                 reward=long.reward[: game.horizon],
                 cost=long.cost[: game.horizon],
                 cost_to_go=to_go,

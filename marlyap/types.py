@@ -35,6 +35,7 @@ class Transition(eqx.Module):
     obs: Obs
     features: Features
     action: Action
+    log_prob: Float[Array, "agent"]  # of the action, under the policy that took it
     reward: Float[Array, "agent"]  # the team's reward is the mean
     cost: Float[Array, "agent"]  # c(s_t, a_t); the team's cost is the mean
     next_obs: Obs

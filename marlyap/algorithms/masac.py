@@ -111,8 +111,8 @@ class MASAC(AbstractAlgorithm):
 
         # a ~ pi_phi(. | s_t) and a_{t+1} ~ pi_phi(. | s_{t+1}): one pass serves every objective
         draw = lambda pi: (
-            jax.vmap(pi.sample)(b.obs, noise[0]),
-            jax.vmap(pi.sample)(b.next_obs, noise[1]),
+            jax.vmap(pi.sample)(b.obs, noise[0], b.action),
+            jax.vmap(pi.sample)(b.next_obs, noise[1], b.action),
         )
         (now, nxt), chain_rule = eqx.filter_vjp(draw, l.pi.value)
 

@@ -1,0 +1,191 @@
+"""The Lyapunov stability constraint of section 3.2, as an object that MASAC is given.
+
+    paper                       here                                    where
+    L_psi(s, a)                 net(features, action)                   below (14)
+    L_target, T                 target, horizon                         below (14)
+    beta in [0, 1] before dL    weight, or learnt as exp(log_weight)    (14)
+    beta before c               decrease                                below (14)
+    l_L l_f                     slope                                   Theorem 1, (13)
+    Delta L                     rise(...)                               below (14)
+
+The paper prints one beta for the weight and for the share of the cost by which L must fall; here
+they are two. As printed, Delta L has a gradient through ||a_phi - a|| alone, which clones the
+actions in the memory, so what is meant has to be read into it:
+
+    han      L(s', a') - L(s, a) + decrease c,  a' from the current policy and a from the memory
+             (Han et al. 2020); the default
+    literal  the same with a' from the memory, plus slope ||a_phi - a||
+    hinge    max(0, L(s') - L(s) + decrease c + slope ||a_phi - a||), only where the action in the
+             memory did make L fall: imitate what worked (Theorem 1 holds for any tuple)
+    score    raise the likelihood of actions after which the state function L fell, and lower it of
+             those after which it rose, with a clipped ratio (as in proximal policy optimisation)
+"""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from marlyap.constraint import AbstractConstraint
+from marlyap.errors import UserError
+from marlyap.learn import Learnt, polyak
+from marlyap.nets import LyapunovNet, NormNet, Sample
+from marlyap.types import Action, Scalar, Transition
+
+
+class Certificate(eqx.Module):
+    """What the constraint has learnt."""
+
+    net: Learnt[LyapunovNet | NormNet]
+    net_bar: LyapunovNet | NormNet  # slow copy, for targets that bootstrap
+    log_weight: Learnt[Scalar]
+    gradient: Scalar  # l_L: the 95 % quantile of |grad L| over batches, a running mean
+    scale: Scalar  # running mean square of the fall of L, for `score`
+
+
+class Lyapunov(AbstractConstraint):
+    """Algorithm 2's term `weight * Delta L` in J_pi, with L learnt beside it."""
+
+    reading: Literal["han", "literal", "hinge", "score"] = "han"
+    function: Literal["squares", "norm"] = "squares"  # L(s, a) sum of squares, or V(s) norm-like
+    horizon: int = 10  # T of L_target, in steps
+    target: Literal["rollout", "hold_last", "bootstrap", "discounted"] = "rollout"
+    discount: float = 0.95  # of the target `discounted`
+    decrease: float = 0.1  # L must fall by this share of the cost
+    weight: float | None = None  # of Delta L in J_pi; None: learnt, in [floor, 1]
+    weight_start: float = 0.3  # the learnt weight to begin with
+    floor: float = 1e-3  # smallest learnt weight
+    ball: float = 0.0  # the constraint holds only where the team's cost exceeds this (m)
+    slope: float | Literal["empirical", "spectral"] = 0.0  # l_L l_f, or how to estimate l_L
+    input_gain: float = 0.505  # l_f per unit of action: 0.101 for the unicycle at 0.1 s, times 5
+    clip: float = 0.2  # the ratio of `score` stays within 1 -+ this
+    normalise: bool = False  # LayerNorm in L
+    rate_L: float = 3e-3  # learning rate of L
+    rate_weight: float = 3e-4  # learning rate of the weight, on its logarithm
+    tau: float = 0.005  # how fast the slow copy of L follows
+
+    def __check_init__(self):
+        if self.function == "norm" and self.reading == "han":
+            raise UserError(
+                "constraint.function: 'norm' is a function of the state alone, which gives the "
+                "reading 'han' no gradient; take reading score or hinge, or function squares."
+            )
+        if self.function == "squares" and self.reading == "score":
+            raise UserError("constraint.reading: 'score' needs constraint.function norm.")
+        if self.function == "squares" and self.slope == "spectral":
+            raise UserError("constraint.slope: 'spectral' needs constraint.function norm.")
+        if not 1 <= self.horizon <= 10_000:
+            raise UserError(f"constraint.horizon: {self.horizon} steps is out of range 1 to 10000.")
+        if self.weight is not None and not 0 <= self.weight < 1e6:
+            raise UserError(f"constraint.weight: {self.weight} must not be negative.")
+
+    @property
+    def foresight(self):
+        return self.horizon, self.target == "rollout"
+
+    def init(self, shape, key):
+        make = LyapunovNet if self.function == "squares" else NormNet
+        net = make(shape, self.normalise, key=key)
+        one = jnp.ones((), jnp.float32)
+        log_weight = jnp.log(self.weight_start * one)
+        return Certificate(Learnt.of(net), net, Learnt.of(log_weight), one, one)
+
+    def value(self, L, b):
+        return L.net.value(b.features, b.action)
+
+    def penalty(self, L, b, now, nxt):
+        """weight * Delta L of one transition, eq. (14), in the chosen reading."""
+        net, moved = L.net.value, distance(now.action, b.action)
+        if self.reading == "han":
+            term = self.rise(L, b, nxt.action)
+        elif self.reading == "literal":
+            term = self.rise(L, b, jax.lax.stop_gradient(nxt.action)) + self.lipschitz(L) * moved
+        elif self.reading == "hinge":
+            rise = jax.lax.stop_gradient(self.rise(L, b, nxt.action))
+            bound = jax.nn.relu(rise + self.lipschitz(L) * moved)
+            term = jnp.where(rise <= 0, bound, 0.0)
+        else:
+            fall = net(b.features, b.action) - net(b.next_features, b.action)
+            advantage = (fall - self.decrease * jnp.mean(b.cost)) / jnp.sqrt(L.scale)
+            term = self.surrogate(now, b, jax.lax.stop_gradient(advantage))
+        return self.multiplier(L) * jnp.where(self.applies(b), term, 0.0)
+
+    def rise(self, L: Certificate, b: Transition, next_action: Action) -> Scalar:
+        """L(s', a') - L(s, a) + decrease c, without Theorem 1's margin."""
+        net = L.net.value
+        fall = net(b.features, b.action) - net(b.next_features, next_action)
+        return self.decrease * jnp.mean(b.cost) - fall
+
+    def J_L(self, net, b: Transition, nxt: Sample, L: Certificate) -> Scalar:
+        """J_L = 1/2 (L(s, a) - L_target)^2, below (14)."""
+        return 0.5 * (net(b.features, b.action) - self.L_target(L, b, nxt)) ** 2
+
+    def L_target(self, L: Certificate, b: Transition, nxt: Sample) -> Scalar:
+        """The sum of the next T costs: as rolled out, or put together from c and the slow L."""
+        now, ahead = jnp.mean(b.cost), jnp.mean(b.cost_ahead)
+        if self.target == "bootstrap":
+            return now - ahead + L.net_bar(b.next_features, nxt.action)
+        if self.target == "discounted":
+            return now + self.discount * L.net_bar(b.next_features, nxt.action)
+        return jnp.mean(b.cost_to_go)
+
+    def update(self, L, b, now, nxt, decay):
+        """psi <- psi - iota_L grad J_L, and the dual step on the weight."""
+        J_L = lambda net, b, nxt: self.J_L(net, b, nxt, L)
+        net, loss = L.net.descend(J_L, b, nxt, rate=decay * self.rate_L)
+
+        rises = jax.vmap(lambda b, a: self.rise(L, b, a))(b, nxt.action)
+        asked = jax.vmap(self.applies)(b)
+        surplus = jnp.sum(jnp.where(asked, rises, 0.0)) / jnp.maximum(jnp.sum(asked), 1)
+        log_weight = L.log_weight.step(-surplus, decay * self.rate_weight)
+        bounded = jnp.clip(log_weight.value, jnp.log(self.floor), 0.0)
+        log_weight = eqx.tree_at(lambda w: w.value, log_weight, bounded)
+
+        info = {"J_L": loss, "weight": self.multiplier(L), "rise": surplus}
+        certificate = Certificate(
+            net,
+            polyak(net.value, L.net_bar, self.tau),
+            log_weight,
+            self.steepness(L, b) if self.slope == "empirical" else L.gradient,
+            0.99 * L.scale + 0.01 * jnp.mean((rises - jnp.mean(rises)) ** 2),
+        )
+        return certificate, info
+
+    def multiplier(self, L: Certificate) -> Scalar:
+        """The weight of Delta L; no gradient reaches it through J_pi."""
+        if self.weight is not None:
+            return jnp.asarray(self.weight)
+        return jax.lax.stop_gradient(jnp.exp(L.log_weight.value))
+
+    def applies(self, b: Transition) -> Array:
+        """Whether the constraint is asked for here: outside the ball."""
+        return jnp.mean(b.cost) > self.ball if self.ball > 0 else jnp.asarray(True)
+
+    def lipschitz(self, L: Certificate) -> Scalar:
+        """l_L l_f, the change of L per unit of action."""
+        if self.slope == "empirical":
+            return L.gradient * self.input_gain
+        if self.slope == "spectral":
+            return L.net.value.lipschitz() * self.input_gain
+        return jnp.asarray(self.slope)
+
+    def steepness(self, L: Certificate, b: Transition) -> Scalar:
+        """The running 95 % quantile of |grad_s L|: an estimate from below of l_L."""
+        total = lambda features: jnp.sum(jax.vmap(L.net.value)(features, b.action))
+        size = jnp.sqrt(jnp.sum(jax.grad(total)(b.features) ** 2, axis=(1, 2)))
+        return 0.99 * L.gradient + 0.01 * jnp.quantile(size, 0.95)
+
+    def surrogate(self, now: Sample, b: Transition, advantage: Scalar) -> Scalar:
+        """-min(ratio A, clipped ratio A), the mean over agents of each one's own ratio."""
+        ratio = jnp.exp(jnp.clip(now.log_prob_memory - b.log_prob, -20.0, 20.0))
+        near = jnp.clip(ratio, 1 - self.clip, 1 + self.clip)
+        return -jnp.mean(jnp.minimum(ratio * advantage, near * advantage))
+
+
+def distance(a: Action, b: Action) -> Scalar:
+    """||a - b||, with a gradient of 0 where they are equal."""
+    square = jnp.sum((a - b) ** 2)
+    safe = jnp.where(square > 0, square, 1.0)
+    return jnp.where(square > 0, jnp.sqrt(safe), 0.0)
