@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from marlyap import graph as graphs
 from marlyap.dynamics import AbstractDynamics
 from marlyap.errors import UserError
-from marlyap.sensing import goal_errors
+from marlyap.sensing import body_frame, goal_errors, near
 from marlyap.types import Action, Features, Key, Obs, Scalar, State
 
 
@@ -70,9 +70,13 @@ class AbstractGame(eqx.Module):
         return goal_errors(self.dynamics, state)
 
     def features(self, state: State) -> Features:
-        """The global state s up to a shift, for the central critic: errors, then headings."""
+        """The global state s up to a shift, for the central critic.
+
+        Per agent its errors, the same magnified near the goal, and its heading.
+        """
+        errors = self.errors(state)
         heading = jax.vmap(self.dynamics.heading)(state.x)
-        return jnp.concatenate([self.errors(state), heading], axis=1)
+        return jnp.concatenate([errors, near(errors[:, :2], self.radius), heading], axis=1)
 
     def costs(self, state: State, action: Action) -> Float[Array, "agent"]:
         """c_i(s, a) >= 0 and 0 on the target set; the team's cost c is their mean."""
@@ -102,6 +106,12 @@ class AbstractGame(eqx.Module):
     def positions(self, state: State) -> Float[Array, "agent 2"]:
         """Where the agents are (m)."""
         return jax.vmap(self.dynamics.position)(state.x)
+
+    def local_view(self, state: State, headings: bool = False) -> Obs:
+        """The usual o_i: everything near agent i in its own frame (`sensing.body_frame`)."""
+        slots, leads = jnp.asarray(self.slots), jnp.asarray(self.leads)
+        linked = self.linked(state)
+        return body_frame(self.dynamics, state, slots, linked, leads, self.radius, headings)
 
     @property
     def adjacency(self) -> Bool[np.ndarray, "agent agent"]:

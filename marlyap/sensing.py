@@ -19,18 +19,29 @@ def into_frame(h: Float[Array, "2"], v: Float[Array, "*n 2"]) -> Float[Array, "*
     return jnp.stack([along, left], axis=-1)
 
 
+def near(v: Float[Array, "*n 2"], scale: float) -> Float[Array, "*n 2"]:
+    """v / (|v| + scale): the direction far away, and close by a magnified v.
+
+    A network fed with metres alone cannot tell centimetres apart.
+    """
+    length = jnp.sqrt(jnp.sum(v * v, axis=-1, keepdims=True) + 1e-12)
+    return v / (length + scale)
+
+
 def body_frame(
     dynamics: AbstractDynamics,
     state: State,
     slots: Int[Array, "agent slot"],
     linked: Bool[Array, "agent agent"],
     leads: Bool[Array, "agent"],
+    scale: float,
     headings: bool,
 ) -> Obs:
     """Per agent: own rates; leader flag and goal - p_i (0 for a follower); for every neighbour slot
     a presence flag, p_j - p_i, the velocity of j, and, if asked, the heading of j.
 
-    Empty slots are all zero.
+    Positions are given in metres and again magnified near zero, at `scale` metres. Empty slots
+    are all zero.
     """
     p = jax.vmap(dynamics.position)(state.x)
     h = jax.vmap(dynamics.heading)(state.x)
@@ -39,13 +50,15 @@ def body_frame(
 
     def of(i, slot, lead):
         there = (slot >= 0) & linked[i, slot]
-        seen = [into_frame(h[i], p[slot] - p[i]), into_frame(h[i], v[slot])]
+        gap = into_frame(h[i], p[slot] - p[i])
+        seen = [gap, near(gap, scale), into_frame(h[i], v[slot])]
         if headings:
             seen.append(into_frame(h[i], h[slot]))
         flag = there.astype(p.dtype)[:, None]
         others = jnp.where(there[:, None], jnp.concatenate([flag, *seen], axis=1), 0.0)
         to_goal = jnp.where(lead, into_frame(h[i], state.goal[i] - p[i]), 0.0)
-        return jnp.concatenate([rates[i], lead.astype(p.dtype)[None], to_goal, others.ravel()])
+        own = [rates[i], lead.astype(p.dtype)[None], to_goal, near(to_goal, scale)]
+        return jnp.concatenate([*own, others.ravel()])
 
     return jax.vmap(of)(jnp.arange(slots.shape[0]), slots, leads)
 

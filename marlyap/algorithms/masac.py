@@ -58,7 +58,7 @@ class MASAC(AbstractAlgorithm):
     actor_width: int = 64  # units in each of two hidden layers
     critic_width: int = 64  # units in each of two hidden layers
     normalise: bool = True  # LayerNorm in the critics
-    heads: Literal["team", "agent"] = "team"  # one value for the team, or one for each agent's cost
+    heads: Literal["team", "agent"] = "agent"  # a value for the team, or one for each agent's cost
     shared: bool = False  # one set of actor weights for all agents
     average: float = 1e-3  # how fast the policy handed out follows the actor; 1 is the actor itself
     keep_Q: bool = True  # False drops Q from the policy objective (Han et al. 2020)

@@ -6,8 +6,7 @@ import jax.numpy as jnp
 from marlyap.dynamics import AbstractDynamics, Unicycle
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
-from marlyap.sensing import body_frame
-from marlyap.types import State
+from marlyap.types import Key, State
 
 
 class Rendezvous(AbstractGame):
@@ -32,14 +31,17 @@ class Rendezvous(AbstractGame):
             raise UserError(f"size: {self.size} m must be a positive distance in metres.")
 
     def reset(self, key):
-        k_position, k_heading, k_target = jax.random.split(key, 3)
-        n = self.agents
-        spread = lambda k, shape: jax.random.uniform(k, shape, minval=-self.size, maxval=self.size)
-        angle = jax.random.uniform(k_heading, (n,), minval=-jnp.pi, maxval=jnp.pi)
-        x = jax.vmap(self.dynamics.rest)(spread(k_position, (n, 2)), angle)
-        goal = jnp.broadcast_to(spread(k_target, (2,)), (n, 2))
-        return State(x=x, goal=goal, t=jnp.asarray(0))
+        return scatter(self.dynamics, self.agents, self.size, key)
 
     def observe(self, state):
-        slots, leads = jnp.asarray(self.slots), jnp.asarray(self.leads)
-        return body_frame(self.dynamics, state, slots, self.linked(state), leads, self.headings)
+        return self.local_view(state, self.headings)
+
+
+def scatter(dynamics: AbstractDynamics, agents: int, size: float, key: Key) -> State:
+    """Agents at rest anywhere in [-size, size]^2, any heading, and one target in it for all."""
+    k_position, k_heading, k_target = jax.random.split(key, 3)
+    spread = lambda k, shape: jax.random.uniform(k, shape, minval=-size, maxval=size)
+    angle = jax.random.uniform(k_heading, (agents,), minval=-jnp.pi, maxval=jnp.pi)
+    x = jax.vmap(dynamics.rest)(spread(k_position, (agents, 2)), angle)
+    goal = jnp.broadcast_to(spread(k_target, (2,)), (agents, 2))
+    return State(x=x, goal=goal, t=jnp.asarray(0))

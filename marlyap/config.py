@@ -1,0 +1,256 @@
+"""Objects as text and back: an object's fields are its configuration, and nothing else is.
+
+`override` sets one field from the command line, `record` and `build` write and read `run.json`.
+Nothing here executes what it reads; code is loaded by `load` alone, from a path the user typed.
+"""
+
+import dataclasses
+import difflib
+import hashlib
+import importlib.util
+import inspect
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import equinox as eqx
+
+from marlyap.algorithm import AbstractAlgorithm
+from marlyap.algorithms import ALGORITHMS
+from marlyap.constraint import AbstractConstraint
+from marlyap.constraints import CONSTRAINTS
+from marlyap.dynamics import DYNAMICS, AbstractDynamics
+from marlyap.errors import UserError
+from marlyap.game import AbstractGame
+from marlyap.tasks import TASKS
+from marlyap.train import Schedule
+
+
+T = TypeVar("T")
+FAMILIES: dict[type, dict[str, Any]] = {
+    AbstractGame: TASKS,
+    AbstractAlgorithm: ALGORITHMS,
+    AbstractConstraint: CONSTRAINTS,
+    AbstractDynamics: DYNAMICS,
+}
+WORDS = {AbstractGame: "task", AbstractAlgorithm: "algorithm"}
+
+
+def known() -> dict[str, type]:
+    """The classes that a record may name without anyone's leave."""
+    members = [type(o) for family in FAMILIES.values() for o in family.values()]
+    return {cls.__name__: cls for cls in [*members, Schedule]}
+
+
+def suggest(word: str, among: Iterable[str]) -> str:
+    """What may have been meant, or what there is."""
+    names = sorted(among)
+    near = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
+    return f"did you mean '{near[0]}'?" if near else f"there is {', '.join(names)}."
+
+
+def load(name: str, family: type[T]) -> T:
+    """The configured object called `name`, or the one at `path/to/file.py:Name`.
+
+    Raises UserError with a suggestion for an unknown name. A file is executed: name your own.
+    """
+    table, word = FAMILIES[family], WORDS[family]
+    if name in table:
+        return table[name]
+    if ":" not in name:
+        raise UserError(f"{word}: no {word} is called '{name}'; {suggest(name, table)}")
+    path, _, attribute = name.rpartition(":")
+    thing = getattr(_module(Path(path), word), attribute, None)
+    if inspect.isclass(thing) and issubclass(thing, family):
+        thing = _construct(thing, {}, name)
+    if not isinstance(thing, family):
+        raise UserError(f"{word}: {path} defines no {word} called '{attribute}'.")
+    return thing
+
+
+def override(obj: T, path: str, text: str) -> T:
+    """`obj` with the field at the dotted `path` set to what `text` says, checked again.
+
+    Raises UserError for an unknown field (with a suggestion) or a value of the wrong kind.
+    """
+    return _override(obj, path.split("."), text, path)
+
+
+def fields(obj: Any) -> dict[str, Any]:
+    """The configuration of an object: its fields by name."""
+    return {f.name: getattr(obj, f.name) for f in dataclasses.fields(obj) if f.init}
+
+
+def record(obj: Any) -> Any:
+    """Plain JSON values: an object becomes its fields and its `kind`."""
+    if isinstance(obj, eqx.Module):
+        return {"kind": type(obj).__name__} | {k: record(v) for k, v in fields(obj).items()}
+    return [record(v) for v in obj] if isinstance(obj, tuple) else obj
+
+
+def build(data: Any, allowed: Mapping[str, type], where: str) -> Any:
+    """The object that `record` wrote. Raises UserError for anything it would not have written."""
+    if not isinstance(data, dict) or not isinstance(data.get("kind"), str):
+        raise UserError(f"{where}: expected an object with a 'kind'; the file may be damaged.")
+    cls = allowed.get(data["kind"])
+    if cls is None:
+        raise UserError(
+            f"{where}: '{data['kind']}' is not part of marlyap; if it is your own code, name it "
+            f"with --{where.split('.')[0]} path/to/file.py:{data['kind']}."
+        )
+    hints, values = _hints(cls), {}
+    for name, value in data.items():
+        if name == "kind":
+            continue
+        if name not in hints:
+            raise UserError(f"{where}.{name}: unknown field; {suggest(name, hints)}")
+        field = f"{where}.{name}"
+        if isinstance(value, dict):
+            values[name] = build(value, allowed, field)
+        else:
+            values[name] = _convert(tuple(value) if isinstance(value, list) else value, hints[name], field)
+    return _construct(cls, values, where)
+
+
+def describe(obj: Any, prefix: str) -> list[tuple[str, str, str]]:
+    """(option, value, comment) for every field, nested ones too; comments come from the source."""
+    rows, notes = [], _comments(type(obj))
+    for name, value in fields(obj).items():
+        rows.append((f"{prefix}.{name}", show(value), notes.get(name, "")))
+        if isinstance(value, eqx.Module):
+            rows += describe(value, f"{prefix}.{name}")
+    return rows
+
+
+def show(value: Any) -> str:
+    """A value as one would type it."""
+    if isinstance(value, eqx.Module):
+        same = [n for t in FAMILIES.values() for n, o in t.items() if type(o) is type(value)]
+        return same[0] if same else type(value).__name__
+    return ",".join(map(show, value)) if isinstance(value, tuple) else str(value)
+
+
+def _override(obj: T, path: list[str], text: str, full: str) -> T:
+    name, rest = path[0], path[1:]
+    have = fields(obj) if dataclasses.is_dataclass(obj) else {}
+    if name not in have:
+        raise UserError(f"{full}: there is no field '{name}'; {suggest(name, have)}")
+    if rest:
+        value = _override(have[name], rest, text, full)
+    else:
+        value = _parse(text, _hints(type(obj))[name], full)
+    return _construct(type(obj), have | {name: value}, "")
+
+
+def _construct(cls: type[T], values: dict[str, Any], where: str) -> T:
+    try:
+        return cls(**values)
+    except UserError as error:
+        raise UserError(f"{where}.{error}" if where and ":" not in where else str(error)) from None
+    except TypeError as error:
+        raise UserError(f"{where or cls.__name__}: {error}.") from None
+
+
+def _parse(text: str, hint: Any, where: str) -> Any:
+    """Text from the command line as a value of the hinted type."""
+    for kind in _alternatives(hint):
+        try:
+            return _parse_as(text, kind)
+        except ValueError:
+            continue
+    raise UserError(f"{where}: '{text}' is not {_expected(hint)}.")
+
+
+def _parse_as(text: str, kind: Any) -> Any:
+    if kind is type(None) and text.lower() in ("none", "null"):
+        return None
+    if kind is bool and text.lower() in ("true", "false", "yes", "no", "1", "0"):
+        return text.lower() in ("true", "yes", "1")
+    if kind in (int, float):
+        return kind(text.replace("_", "")) if kind is int else _finite(float(text))
+    if kind is str:
+        return text
+    if typing.get_origin(kind) is Literal and text in typing.get_args(kind):
+        return text
+    if typing.get_origin(kind) is tuple:
+        item = typing.get_args(kind)[0]
+        return tuple(_parse_as(part.strip(), item) for part in text.strip("()[]").split(",") if part)
+    if kind in FAMILIES and text in FAMILIES[kind]:
+        return FAMILIES[kind][text]
+    raise ValueError(text)
+
+
+def _finite(value: float) -> float:
+    if value != value or abs(value) == float("inf"):
+        raise ValueError(value)
+    return value
+
+
+def _convert(value: Any, hint: Any, where: str) -> Any:
+    """A value read from JSON, if it is of the hinted type."""
+    for kind in _alternatives(hint):
+        origin = typing.get_origin(kind)
+        if origin is Literal and value in typing.get_args(kind):
+            return value
+        if origin is tuple and isinstance(value, tuple):
+            return tuple(_convert(v, typing.get_args(kind)[0], where) for v in value)
+        if kind is float and type(value) in (int, float):
+            return float(value)
+        if isinstance(kind, type) and type(value) is kind:
+            return value
+    raise UserError(f"{where}: {value!r} is not {_expected(hint)}.")
+
+
+def _alternatives(hint: Any) -> list[Any]:
+    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    kinds = list(typing.get_args(hint)) if union else [hint]
+    return sorted(kinds, key=lambda k: (k is str, k is float))  # the narrowest first
+
+
+def _expected(hint: Any) -> str:
+    names = []
+    for kind in _alternatives(hint):
+        if typing.get_origin(kind) is Literal:
+            names += map(str, typing.get_args(kind))
+        elif typing.get_origin(kind) is tuple:
+            names.append(f"{typing.get_args(kind)[0].__name__}s with commas between")
+        elif kind in FAMILIES:
+            names += FAMILIES[kind]
+        else:
+            plain = {int: "a whole number", float: "a number", bool: "true or false"}
+            names.append("none" if kind is type(None) else plain.get(kind, kind.__name__))
+    return " or ".join(names)
+
+
+def _hints(cls: type) -> dict[str, Any]:
+    hints = typing.get_type_hints(cls)
+    return {f.name: hints[f.name] for f in dataclasses.fields(cls) if f.init}
+
+
+def _comments(cls: type) -> dict[str, str]:
+    """The comment behind each field, from the source of the class where it can be read."""
+    try:
+        lines = inspect.getsource(cls).splitlines()
+    except OSError:
+        return {}
+    pairs = (line.split("#", 1) for line in lines if "#" in line and ":" in line.split("#")[0])
+    return {code.split(":")[0].strip(): note.strip() for code, note in pairs}
+
+
+def _module(path: Path, word: str) -> types.ModuleType:
+    if not path.is_file():
+        raise UserError(f"{word}: there is no file {path}.")
+    name = f"marlyap_user_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise UserError(f"{word}: {path} is not a Python file.")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(f"{word}: {path} could not be loaded: {error}.") from error
+    return module

@@ -1,0 +1,48 @@
+"""Formation: the agents take their places on a circle round a centre that only leaders see."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from marlyap.dynamics import AbstractDynamics, Unicycle
+from marlyap.errors import UserError
+from marlyap.game import AbstractGame
+from marlyap.tasks.rendezvous import scatter
+from marlyap.types import State
+
+
+class Formation(AbstractGame):
+    """Agent i ends within `radius` of its place; a leader sees its own place.
+
+    The formation is turned by a random angle each episode, so followers must read it off the
+    others.
+    """
+
+    agents: int = 3  # N
+    leaders: tuple[int, ...] = (0, 1)  # the agents that see their place
+    graph: str = "complete"  # complete, path, ring, star, disk:RADIUS or edges such as 0-1,1-2
+    spread: float = 0.5  # radius of the circle on which the places lie (m)
+    radius: float = 0.1  # an agent has arrived when it is this close to its place (m)
+    size: float = 1.0  # starts and centres are uniform in [-size, size]^2 (m)
+    headings: bool = False  # whether neighbours' headings are seen
+    dt: float = 0.1  # s
+    horizon: int = 40  # steps in an episode
+    dynamics: AbstractDynamics = Unicycle()
+
+    def __check_init__(self):
+        if not 0 < self.spread < 1e6:
+            raise UserError(f"spread: {self.spread} m must be a positive distance in metres.")
+
+    def reset(self, key):
+        k_start, k_turn = jax.random.split(key)
+        start = scatter(self.dynamics, self.agents, self.size, k_start)
+        turn = jax.random.uniform(k_turn, (), minval=-jnp.pi, maxval=jnp.pi)
+        return State(x=start.x, goal=start.goal + self.places(turn), t=start.t)
+
+    def places(self, turn: Float[Array, ""]) -> Float[Array, "agent 2"]:
+        """Offsets of the agents' places from the centre (m)."""
+        angle = turn + 2 * jnp.pi * jnp.arange(self.agents) / self.agents
+        return self.spread * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+
+    def observe(self, state):
+        return self.local_view(state, self.headings)
