@@ -1,0 +1,174 @@
+"""The house stands: imports only go down, and what is dangerous or heavy stays where it belongs."""
+
+import ast
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import marlyap
+
+
+# Bottom first. A module may import those above it in this table only. A package is one floor,
+# within which imports must not go in circles. A new module needs one line here.
+FLOORS = """
+    errors
+    types
+    seeds
+    statistics
+    store
+    dynamics
+    graph
+    sensing
+    game
+    tasks
+    rollout
+    replay
+    layout
+    nets
+    learn
+    algorithm
+    constraint
+    constraints
+    algorithms
+    controllers
+    evaluate
+    train
+    lyapunov_function
+    certificate
+    certificates
+    certify
+    report
+    draw
+    config
+    run
+    fit
+    cli
+""".split()
+
+ROOT = Path(marlyap.__file__).parent
+FILES = sorted(p for p in ROOT.rglob("*.py") if "__pycache__" not in p.parts)
+NAMES = {
+    ".".join(("marlyap", *p.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__")
+    for p in FILES
+}
+TREES = {p: ast.parse(p.read_text()) for p in FILES}
+each_file = pytest.mark.parametrize("file", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+
+
+def module(file):
+    """The dotted name of a file."""
+    return ".".join(("marlyap", *file.relative_to(ROOT).with_suffix("").parts)).removesuffix(
+        ".__init__"
+    )
+
+
+def imported(file, tree=None):
+    """Every module that a file imports, wherever in it, `from package import module` included."""
+    found = set()
+    package = module(file).split(".") if file.stem == "__init__" else module(file).split(".")[:-1]
+    for node in ast.walk(tree or TREES[file]):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            start = ".".join([*base, *([node.module] if node.module else [])])
+            below = {f"{start}.{alias.name}" for alias in node.names} & NAMES
+            whole = len(below) < len(node.names)
+            found |= below | ({start} if whole else set())
+    return found
+
+
+def own(file):
+    return {name for name in imported(file) if name.split(".")[0] == "marlyap"}
+
+
+def floor(name):
+    """The line of the table a module is on."""
+    return FLOORS.index(name.split(".")[1])
+
+
+@each_file
+def test_every_module_has_a_floor(file):
+    name = module(file).split(".")
+    assert len(name) == 1 or name[1] in FLOORS, f"add {name[1]} to FLOORS in {__file__}"
+
+
+@each_file
+def test_imports_only_go_down(file):
+    here = module(file)
+    if here == "marlyap":  # the public names, from every floor
+        return
+    for name in own(file):
+        assert name != "marlyap", f"{here} imports the package itself"
+        same_package = (
+            name.split(".")[1] == here.split(".")[1] and (ROOT / here.split(".")[1]).is_dir()
+        )
+        assert same_package or floor(name) < floor(here), f"{here} imports {name}"
+
+
+def test_no_circles():
+    uses = {module(f): own(f) - {module(f)} for f in FILES}
+    done = {"marlyap"}
+    while rest := {m: u - done for m, u in uses.items() if m not in done}:
+        free = {m for m, u in rest.items() if not u}
+        assert free, f"imports go in a circle among {sorted(rest)}"
+        done |= free
+
+
+def test_the_walk_sees_every_form_of_import():
+    source = """
+import marlyap.store as s
+from marlyap import graph as graphs, errors
+from marlyap.types import Key
+def later():
+    from . import evaluate
+    from .algorithms.masac import MASAC
+    import os.path
+"""
+    found = imported(ROOT / "train.py", ast.parse(source))
+    assert found == {
+        "marlyap.store", "marlyap.graph", "marlyap.errors", "marlyap.types",
+        "marlyap.evaluate", "marlyap.algorithms.masac", "os.path",
+    }  # fmt: skip
+
+
+def test_an_upward_import_is_noticed(monkeypatch):
+    file = ROOT / "game.py"
+    bad = ast.parse("def f():\n    from marlyap.train import Trainer\n")
+    monkeypatch.setitem(TREES, file, bad)
+    with pytest.raises(AssertionError, match=re.escape("marlyap.game imports marlyap.train")):
+        test_imports_only_go_down(file)
+
+
+@each_file
+def test_only_draw_imports_matplotlib(file):
+    if module(file) != "marlyap.draw":
+        assert not {name for name in imported(file) if name.split(".")[0] in ("matplotlib", "PIL")}
+        assert "import_module" not in ast.dump(TREES[file])  # which would hide an import
+
+
+@each_file
+def test_nothing_runs_what_it_reads(file):
+    unsafe = {"pickle", "cloudpickle", "dill", "marshal", "shelve", "joblib"}
+    assert not {name.split(".")[0] for name in imported(file)} & unsafe
+    for node in ast.walk(TREES[file]):
+        if isinstance(node, ast.Call):
+            name = ast.unparse(node.func)
+            assert name not in ("eval", "exec", "compile"), f"line {node.lineno}"
+            allows = {k.arg: k.value for k in node.keywords}.get("allow_pickle")
+            assert allows is None or ast.unparse(allows) == "False", f"line {node.lineno}"
+
+
+def test_annotations_are_executed():
+    from marlyap.sensing import into_frame
+
+    with pytest.raises(Exception, match="(?i)type-check|beartype"):
+        into_frame(jnp.ones(3), jnp.ones((4, 2)))
+
+
+def test_rank_promotion_raises():
+    with pytest.raises(ValueError, match="rank_promotion"):
+        jax.jit(lambda x, y: x + y)(jnp.ones(3), jnp.ones((2, 3)))
