@@ -5,7 +5,7 @@ import abc
 import equinox as eqx
 from jaxtyping import PyTree
 
-from marlyap.nets import Shape
+from marlyap.nets import LyapunovNet, NormNet, Shape
 from marlyap.rollout import AbstractExplorer, Policy
 from marlyap.types import Key, Scalar, Transition
 
@@ -39,3 +39,7 @@ class AbstractAlgorithm(eqx.Module):
     @abc.abstractmethod
     def exploit(self, learner: PyTree) -> Policy:
         """The deterministic policy that is evaluated, certified and deployed."""
+
+    @abc.abstractmethod
+    def lyapunov(self, learner: PyTree) -> LyapunovNet | NormNet | None:
+        """The Lyapunov function (features, action) -> L learnt so far, if there is one."""

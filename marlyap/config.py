@@ -110,7 +110,9 @@ def build(data: Any, allowed: Mapping[str, type], where: str) -> Any:
         if isinstance(value, dict):
             values[name] = build(value, allowed, field)
         else:
-            values[name] = _convert(tuple(value) if isinstance(value, list) else value, hints[name], field)
+            values[name] = _convert(
+                tuple(value) if isinstance(value, list) else value, hints[name], field
+            )
     return _construct(cls, values, where)
 
 
@@ -176,7 +178,9 @@ def _parse_as(text: str, kind: Any) -> Any:
         return text
     if typing.get_origin(kind) is tuple:
         item = typing.get_args(kind)[0]
-        return tuple(_parse_as(part.strip(), item) for part in text.strip("()[]").split(",") if part)
+        return tuple(
+            _parse_as(part.strip(), item) for part in text.strip("()[]").split(",") if part
+        )
     if kind in FAMILIES and text in FAMILIES[kind]:
         return FAMILIES[kind][text]
     raise ValueError(text)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from marlyap.nets import Sample, Shape
+from marlyap.nets import LyapunovNet, NormNet, Sample, Shape
 from marlyap.types import Key, Scalar, Transition
 
 
@@ -33,8 +33,8 @@ class AbstractConstraint(eqx.Module):
         """One step of learning on a batch (all arguments but L and decay are batched)."""
 
     @abc.abstractmethod
-    def value(self, L: PyTree, b: Transition) -> Scalar:
-        """L(s, a) of one transition, for reports; 0 where there is no Lyapunov function."""
+    def lyapunov(self, L: PyTree) -> LyapunovNet | NormNet | None:
+        """The Lyapunov function (features, action) -> L learnt so far, if there is one."""
 
 
 class Unconstrained(AbstractConstraint):
@@ -53,5 +53,5 @@ class Unconstrained(AbstractConstraint):
     def update(self, L, b, now, nxt, decay):
         return L, {}
 
-    def value(self, L, b):
-        return jnp.zeros(())
+    def lyapunov(self, L):
+        return None

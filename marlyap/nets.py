@@ -56,8 +56,7 @@ class MLP(eqx.Module):
         keys = jax.random.split(key, len(sizes) - 1)
         last = len(sizes) - 2
         self.layers = tuple(
-            Layer(sizes[i], sizes[i + 1], normalise and i < last, key=k)
-            for i, k in enumerate(keys)
+            Layer(sizes[i], sizes[i + 1], normalise and i < last, key=k) for i, k in enumerate(keys)
         )
 
     def __call__(self, x: Float[Array, "in"]) -> Float[Array, "out"]:

@@ -1,4 +1,4 @@
-"""The outer loop of Algorithms 1 and 2: play, remember, learn; compiled, one iteration at a time."""
+"""The outer loop of Algorithms 1 and 2: play, remember, learn; compiled an iteration at a time."""
 
 import equinox as eqx
 import jax
@@ -7,10 +7,19 @@ from jaxtyping import Array, Int, PyTree
 
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.errors import UserError
+from marlyap.evaluate import outcomes
 from marlyap.game import AbstractGame
 from marlyap.nets import Shape
 from marlyap.replay import Episode, Replay
-from marlyap.rollout import AbstractExplorer, Decentralised, Uniform, cost_to_go, rollout
+from marlyap.rollout import (
+    AbstractExplorer,
+    Decentralised,
+    Policy,
+    Uniform,
+    cost_to_go,
+    rollout,
+)
+from marlyap.seeds import stream
 from marlyap.types import Key, Scalar
 
 
@@ -24,6 +33,24 @@ class Schedule(eqx.Module):
     capacity: int = 1_024_000  # environment steps that the replay memory holds
     decay: float = 0.1  # learning rates are multiplied by this ...
     decay_episodes: int | None = None  # ... every so many episodes (None: over the whole run)
+    judge_every: int = 8  # iterations between looks at the policy
+    judge_episodes: int = 500  # starts on which the best policy so far is chosen
+
+    def __check_init__(self):
+        for name, low, high in (
+            ("steps", 1, 10**12),
+            ("environments", 1, 10**6),
+            ("steps_per_update", 1, 10**9),
+            ("warmup", 0, 10**9),
+            ("capacity", 1, 10**9),
+            ("judge_every", 1, 10**9),
+            ("judge_episodes", 1, 10**6),
+        ):
+            if not low <= getattr(self, name) <= high:
+                value = getattr(self, name)
+                raise UserError(f"{name}: {value} is out of range; take {low} to {high}.")
+        if not 0 < self.decay <= 1:
+            raise UserError(f"decay: {self.decay} must lie in (0, 1].")
 
 
 class Carry(eqx.Module):
@@ -33,12 +60,15 @@ class Carry(eqx.Module):
     memory: Replay
     key: Key
     iteration: Int[Array, ""]
+    best: Policy  # of those looked at, the one with the highest score
+    score: Scalar
 
 
 def shape(game: AbstractGame) -> Shape:
     """What the algorithm may know of the game."""
-    look = lambda key: (lambda s: (game.observe(s), game.features(s), game.errors(s)))(game.reset(key))
-    obs, features, errors = eqx.filter_eval_shape(look, jax.random.key(0))
+    state = eqx.filter_eval_shape(game.reset, jax.random.key(0))
+    see = lambda s: (game.observe(s), game.features(s), game.errors(s))
+    obs, features, errors = eqx.filter_eval_shape(see, state)
     return Shape(game.agents, obs.shape[1], features.shape[1], errors.shape[1], game.dynamics.du)
 
 
@@ -70,7 +100,8 @@ class Trainer(eqx.Module):
         warm = self.play(random, k_warm, episodes)
         rows = max(s.capacity // self.game.horizon, episodes, s.environments)
         memory = Replay.empty(jax.tree.map(lambda x: x[0], warm), rows).add(warm)
-        return Carry(learner, memory, key, jnp.asarray(0))
+        best = self.algorithm.exploit(learner)
+        return Carry(learner, memory, key, jnp.asarray(0), best, jnp.zeros(()))
 
     def iterate(self, carry: Carry) -> tuple[Carry, dict[str, Scalar]]:
         """Play, remember, learn; the dict is for the log."""
@@ -91,7 +122,28 @@ class Trainer(eqx.Module):
         dynamic, info = jax.lax.scan(learn, dynamic, keys)
         info = jax.tree.map(jnp.mean, info)
         info["return"] = jnp.mean(jnp.sum(jnp.mean(new.reward, axis=2), axis=1))
-        return Carry(eqx.combine(dynamic, static), memory, key, carry.iteration + 1), info
+        for name in ("obs", "features", "action", "reward", "cost"):
+            info[f"bad_{name}"] = jnp.sum(~jnp.isfinite(getattr(new, name)))
+        learner = eqx.combine(dynamic, static)
+        done = carry.iteration + 1
+        return Carry(learner, memory, key, done, carry.best, carry.score), info
+
+    def judge(self, carry: Carry) -> tuple[Carry, dict[str, Scalar]]:
+        """Look at the policy from starts kept for this alone, and keep it if it is the best.
+
+        Its score is the success rate, plus a tenth of that at half the radius to break ties.
+        """
+        policy = self.algorithm.exploit(carry.learner)
+        keys = jax.random.split(stream(0, "select"), self.schedule.judge_episodes)
+        final = outcomes(self.game, Decentralised(policy, self.game), keys).final
+        within = lambda r: jnp.mean((final <= r).astype(float))
+        score = within(self.game.radius) + 0.1 * within(self.game.radius / 2)
+        better = score >= carry.score
+        keep = lambda new, old: jnp.where(better, new, old) if eqx.is_array(new) else new
+        best = jax.tree.map(keep, policy, carry.best)
+        score = jnp.maximum(score, carry.score)
+        carry = Carry(carry.learner, carry.memory, carry.key, carry.iteration, best, score)
+        return carry, {"success": within(self.game.radius), "distance": jnp.mean(final)}
 
     def play(self, policy: AbstractExplorer, key: Key, episodes: int) -> Episode:
         """`episodes` fresh episodes, as the memory keeps them."""
@@ -125,3 +177,18 @@ class Trainer(eqx.Module):
         s = self.schedule
         span = s.decay_episodes or self.iterations * s.environments
         return s.decay ** (iteration * s.environments / span)
+
+
+SCHEDULES = {
+    "tuned": Schedule(),
+    # Section 4: one environment, one update a step, rates falling to 7.5 % every 2000 episodes.
+    "paper": Schedule(
+        steps=100_000,
+        environments=1,
+        steps_per_update=1,
+        warmup=1_000,
+        decay=0.075,
+        decay_episodes=2_000,
+        judge_every=50,
+    ),
+}

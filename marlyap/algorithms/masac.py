@@ -27,7 +27,6 @@ from jaxtyping import PyTree
 
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.constraint import AbstractConstraint, Unconstrained
-from marlyap.errors import UserError
 from marlyap.learn import Learnt, polyak
 from marlyap.nets import Actors, Critic, Greedy, Sample, Sampled
 from marlyap.types import Scalar, Transition
@@ -149,6 +148,9 @@ class MASAC(AbstractAlgorithm):
 
     def exploit(self, learner):
         return Greedy(learner.pi_mean)
+
+    def lyapunov(self, learner):
+        return self.constraint.lyapunov(learner.L)
 
     def team(self, per_agent):
         """What the critics' heads stand for: the team's mean, or each agent."""

@@ -26,7 +26,7 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from marlyap.constraint import AbstractConstraint
 from marlyap.errors import UserError
@@ -92,8 +92,8 @@ class Lyapunov(AbstractConstraint):
         log_weight = jnp.log(self.weight_start * one)
         return Certificate(Learnt.of(net), net, Learnt.of(log_weight), one, one)
 
-    def value(self, L, b):
-        return L.net.value(b.features, b.action)
+    def lyapunov(self, L):
+        return L.net.value
 
     def penalty(self, L, b, now, nxt):
         """weight * Delta L of one transition, eq. (14), in the chosen reading."""

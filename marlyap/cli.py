@@ -1,0 +1,169 @@
+"""The command line: what was asked for, in words. The work is in `commands`, imported only then.
+
+Nothing here imports JAX, so help and bad usage answer at once.
+"""
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from marlyap.errors import UserError
+
+
+OVERRIDES = """
+any field of the task, the algorithm and the schedule can be set by its dotted name:
+  --task.agents 5 --task.graph path --task.dynamics.limits 2,2
+  --algorithm.rate_Q 1e-3 --algorithm.constraint.reading hinge --schedule.environments 16
+`marlyap list TASK` and `marlyap list ALGORITHM` show the fields and their values.
+TASK and ALGORITHM may also be path/to/file.py:Name, code of your own.
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """Errors are one sentence and exit code 2, like every other bad input."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message}; see {self.prog} --help.")
+
+
+def parser() -> Parser:
+    """All verbs and their options."""
+    top = Parser(
+        prog="marlyap",
+        description="Train decentralised controllers for teams of robots, hold them to a Lyapunov "
+        "condition, and measure what they do.",
+    )
+    top.add_argument("--version", action="store_true", help="print the version and stop")
+    verbs = top.add_subparsers(dest="verb", metavar="VERB", parser_class=Parser)
+
+    def verb(name: str, help: str, epilog: str = "") -> Parser:
+        p = verbs.add_parser(
+            name,
+            help=help,
+            description=help[0].upper() + help[1:] + ".",
+            epilog=epilog,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        p.add_argument("--json", action="store_true", help="print one JSON object on standard output")
+        return p
+
+    p = verb("demo", "train, evaluate and report the main task, from nothing to a film")
+    p.add_argument("--out", type=Path, default=Path("runs/demo"), help="directory of the runs")
+    p.add_argument("--seeds", nargs="+", default=["0", "1"], help="training seeds (default 0 1)")
+    p.add_argument("--steps", type=int, default=None, help="environment steps of each")
+    p.add_argument("--again", action="store_true", help="train anew what is there already")
+
+    p = verb("train", "train a team, one run for each seed", OVERRIDES)
+    p.add_argument("task", nargs="?", metavar="TASK", help="a name of `marlyap list`")
+    p.add_argument("algorithm", nargs="?", metavar="ALGORITHM", help="a name of `marlyap list`")
+    p.add_argument("--seeds", nargs="+", default=["0"], help="training seeds (default 0)")
+    p.add_argument("--steps", type=int, default=None, help="environment steps of each seed")
+    p.add_argument("--out", type=Path, default=None, help="directory (default runs/TASK/ALGORITHM)")
+    p.add_argument("--preset", default="tuned", help="tuned (default) or paper")
+    p.add_argument("--force", action="store_true", help="overwrite runs that are there")
+    p.add_argument("--resume", type=Path, nargs="+", metavar="RUN", help="go on with these runs")
+    p.add_argument("--parallel", default="auto", help="seeds: auto, process (one a core) or vmap")
+    p.add_argument("--device", default=None, help="cpu or gpu (default: what JAX finds)")
+    p.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
+
+    p = verb("evaluate", "measure runs or hand-written controllers on fresh starts", OVERRIDES)
+    p.add_argument("runs", nargs="+", metavar="RUN", help="run directories or controller names")
+    p.add_argument("--task", default=None, help="the task, for controllers or tasks of your own")
+    p.add_argument("--algorithm", default=None, help="the algorithm, where it is your own code")
+    p.add_argument("--episodes", type=int, default=500, help="fresh starts (default 500)")
+    p.add_argument("--seed", type=int, default=0, help="of the starts (default 0)")
+    p.add_argument("--confidence", type=float, default=0.95, help="of the intervals")
+
+    p = verb("report", "write one HTML file (and PNGs) about runs")
+    p.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run directories")
+    p.add_argument("--out", type=Path, default=None, help="HTML file (default in the first run)")
+    p.add_argument("--episodes", type=int, default=500, help="fresh starts (default 500)")
+    p.add_argument("--seed", type=int, default=0, help="of the starts (default 0)")
+    p.add_argument("--task", default=None, help="the task, where it is your own code")
+    p.add_argument("--algorithm", default=None, help="the algorithm, where it is your own code")
+
+    p = verb("watch", "film one episode of a run, as GIF and HTML")
+    p.add_argument("run", type=Path, metavar="RUN", help="a run directory")
+    p.add_argument("--episode", type=int, default=0, help="which of the evaluation starts")
+    p.add_argument("--seed", type=int, default=0, help="of the starts (default 0)")
+    p.add_argument("--out", type=Path, default=None, help="where to put the film (default: the run)")
+    p.add_argument("--task", default=None, help="the task, where it is your own code")
+    p.add_argument("--algorithm", default=None, help="the algorithm, where it is your own code")
+
+    p = verb("list", "list tasks, algorithms and controllers, or the fields of one")
+    p.add_argument("name", nargs="?", help="a task or an algorithm: shows its fields")
+    return top
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code (0 done, 2 bad input, 130 or 143 stopped)."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    try:
+        args, overrides = parse(argv)
+        if args.version:
+            from importlib.metadata import version
+
+            print(version("marlyap"))
+            return 0
+        if args.verb is None:
+            parser().print_help()
+            return 0
+        prepare(args)
+        from marlyap import commands
+
+        result, code = commands.VERBS[args.verb](args, overrides)
+        if args.json and result is not None:
+            print(json.dumps(result))
+        return code
+    except UserError as error:
+        print(f"marlyap: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, dict[str, str]]:
+    """Options, and the overrides `--task.FIELD value` by dotted name."""
+    plain, overrides = [], {}
+    words = iter(argv)
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not (word.startswith("--") and "." in name and name[2:].split(".")[0] in PARTS):
+            plain.append(word)
+            continue
+        if not equals:
+            value = next(words, None)
+        if value is None:
+            raise UserError(f"{name}: it needs a value, as in {name} VALUE.")
+        if name[2:] in overrides:
+            raise UserError(f"{name}: it is given twice.")
+        overrides[name[2:]] = value
+    return parser().parse_args(plain), overrides
+
+
+PARTS = ("task", "algorithm", "schedule")
+
+
+def prepare(args: Any) -> None:
+    """Set what JAX reads when it is imported: the device, and one core where one is faster."""
+    device = getattr(args, "device", None)
+    if device not in (None, "cpu", "gpu"):
+        raise UserError(f"device: '{device}' must be cpu or gpu.")
+    if device:
+        os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": "cuda"}[device]
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_directory()))
+    core = os.environ.get("MARLYAP_CORE")
+    if core and core.isdigit() and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {int(core)})
+
+
+def cache_directory() -> Path:
+    """Where compiled programs are kept between starts."""
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(base) / "marlyap" / "jax"

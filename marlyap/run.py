@@ -1,0 +1,254 @@
+"""A run: one directory that says what it is and holds all that is needed to go on with it.
+
+run.json        task, algorithm, schedule, seed, versions: enough to repeat it
+log.jsonl       one line an iteration
+checkpoints/    the whole learner, replay memory and random keys included; the last two
+policy/         the best policy so far, and the Lyapunov function: what is evaluated and deployed
+"""
+
+import json
+import platform
+import shutil
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from marlyap import config, store
+from marlyap.algorithm import AbstractAlgorithm
+from marlyap.errors import UserError
+from marlyap.game import AbstractGame
+from marlyap.nets import LyapunovNet, NormNet
+from marlyap.rollout import Decentralised, Policy
+from marlyap.seeds import stream
+from marlyap.train import Carry, Schedule, Trainer, shape
+
+
+SCHEMA = 1
+PACKAGES = ("marlyap", "jax", "jaxlib", "equinox", "optax", "numpy")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run on disk. Make it with `create` or `open`."""
+
+    directory: Path
+    trainer: Trainer
+    seed: int
+    names: dict[str, str]  # what the task and the algorithm were called
+
+    @classmethod
+    def create(
+        cls,
+        directory: Path,
+        trainer: Trainer,
+        seed: int,
+        names: dict[str, str],
+        force: bool = False,
+    ) -> "Run":
+        """A new run directory. Raises UserError if it exists, unless `force` empties it."""
+        if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+            if not force:
+                raise UserError(
+                    f"out: {directory} already exists; choose another directory, go on with it by "
+                    f"--resume {directory}, or overwrite it with --force."
+                )
+            if not (directory / "run.json").is_file():
+                raise UserError(f"out: {directory} is not a run; --force would destroy it.")
+            shutil.rmtree(directory)
+        about = {
+            "schema": SCHEMA,
+            "task": config.record(trainer.game),
+            "algorithm": config.record(trainer.algorithm),
+            "schedule": config.record(trainer.schedule),
+            "seed": seed,
+            "names": names,
+            "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "versions": versions(),
+        }
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f"out: {directory} cannot be made ({error.strerror}).") from None
+        store.write_text_atomic(directory / "run.json", json.dumps(about, indent=1) + "\n")
+        return cls(directory, trainer, seed, names)
+
+    @classmethod
+    def open(
+        cls,
+        directory: Path,
+        game: AbstractGame | None = None,
+        algorithm: AbstractAlgorithm | None = None,
+    ) -> "Run":
+        """A run that exists; pass the task or algorithm if it is code of your own.
+
+        Raises UserError if the directory is not a run, or was changed, or is from a newer version.
+        """
+        if not (directory / "run.json").is_file():
+            raise UserError(f"run: {directory} is not a run (it has no run.json).")
+        about = store.read_json(directory / "run.json")
+        where = str(directory / "run.json")
+        wanted = {"schema", "task", "algorithm", "schedule", "seed", "names"}
+        if not isinstance(about, dict) or not wanted <= about.keys():
+            raise UserError(f"run: {where} lacks some of its fields; use another copy of this run.")
+        if about["schema"] != SCHEMA:
+            raise UserError(
+                f"run: {where} has schema {about['schema']}, this marlyap reads {SCHEMA}."
+            )
+        if type(about["seed"]) is not int or not isinstance(about["names"], dict):
+            raise UserError(f"run: {where} has a seed or names of the wrong kind.")
+        own = {type(o).__name__: type(o) for o in (game, algorithm) if o is not None}
+        parts = [
+            config.build(about[part], config.known() | own, part)
+            for part in ("task", "algorithm", "schedule")
+        ]
+        for part, family in zip(parts, (AbstractGame, AbstractAlgorithm, Schedule), strict=True):
+            if not isinstance(part, family):
+                raise UserError(f"run: {where} has a {type(part).__name__} in the wrong place.")
+        names = {k: str(about["names"].get(k, "")) for k in ("task", "algorithm", "preset")}
+        return cls(directory, Trainer(*parts), about["seed"], names)
+
+    @property
+    def game(self) -> AbstractGame:
+        return self.trainer.game
+
+    @property
+    def title(self) -> str:
+        return f"{self.names['task']} {self.names['algorithm']} seed {self.seed}"
+
+    @property
+    def checkpoints(self) -> store.Checkpoints:
+        return store.Checkpoints(self.directory / "checkpoints")
+
+    @property
+    def steps_done(self) -> int:
+        """Environment steps in the newest checkpoint's name; 0 before the first."""
+        steps = self.checkpoints.steps()
+        return max(steps) * self.trainer.steps_per_iteration if steps else 0
+
+    @property
+    def finished(self) -> bool:
+        return self.steps_done >= self.trainer.iterations * self.trainer.steps_per_iteration
+
+    def begin(self) -> Carry:
+        """The state of a fresh run."""
+        return _begin(self.trainer, stream(self.seed, "train"))
+
+    def save(self, carry: Carry, seconds: float) -> None:
+        """Checkpoint everything, and hand out the best policy with its Lyapunov function."""
+        self.checkpoints.save(int(carry.iteration), flatten(carry), {"seconds": seconds})
+        handed = (carry.best, self.trainer.algorithm.lyapunov(carry.learner))
+        meta = {"seed": self.seed, "iteration": int(carry.iteration), "score": float(carry.score)}
+        store.write(self.directory / "policy", "policy", flatten(handed), meta, replace=True)
+
+    def load(self) -> tuple[Carry, float, tuple[str, ...]]:
+        """The newest sound checkpoint, the seconds spent so far, and warnings about unsound ones."""
+        if not self.checkpoints.steps():
+            return self.begin(), 0.0, ()
+        saved = self.checkpoints.latest()
+        like = eqx.filter_eval_shape(self.trainer.begin, jax.random.key(0))
+        carry = unflatten(like, saved.arrays, str(self.directory))
+        return carry, float(saved.meta.get("seconds", 0.0)), saved.warnings
+
+    def handed_out(self) -> tuple[Policy, LyapunovNet | NormNet | None]:
+        """The policy that this run hands out, and its Lyapunov function if it has one."""
+        place = self.directory / "policy"
+        if not place.is_dir():
+            raise UserError(f"run: {self.directory} has no policy yet; train it first.")
+        arrays, _ = store.read(place, "policy")
+        a = self.trainer.algorithm
+        learner = eqx.filter_eval_shape(a.init, shape(self.game), jax.random.key(0))
+        like = (a.exploit(learner), a.lyapunov(learner))
+        return unflatten(like, arrays, str(place))
+
+    def controller(self) -> Decentralised:
+        """The policy as a controller of this run's game."""
+        return Decentralised(self.handed_out()[0], self.game)
+
+    def log(self, line: dict[str, Any]) -> None:
+        """One line an iteration; numbers that are not finite are left out."""
+        sound = {k: v for k, v in line.items() if not isinstance(v, float) or np.isfinite(v)}
+        store.append_line(self.directory / "log.jsonl", json.dumps(sound))
+
+    def history(self) -> list[dict[str, Any]]:
+        path = self.directory / "log.jsonl"
+        lines = store.read_jsonl(path) if path.is_file() else []
+        return [line for line in lines if isinstance(line, dict)]
+
+    def rewind(self, iteration: int) -> None:
+        """Forget what the log says of iterations that will be done again."""
+        kept = [line for line in self.history() if line.get("iteration", 0) <= iteration]
+        text = "".join(json.dumps(line) + "\n" for line in kept)
+        store.write_text_atomic(self.directory / "log.jsonl", text)
+
+
+@eqx.filter_jit
+def _begin(trainer: Trainer, key: jax.Array) -> Carry:
+    return trainer.begin(key)
+
+
+def expand(paths: Iterable[Path]) -> list[Path]:
+    """Run directories: those given, and those one level below the others.
+
+    Raises UserError where there is none, or one is given twice.
+    """
+    found: list[Path] = []
+    for path in paths:
+        here = [path] if (path / "run.json").exists() else sorted(path.glob("*/run.json"))
+        if not here:
+            raise UserError(f"run: {path} is not a run and holds none.")
+        found += [p.parent if p.name == "run.json" else p for p in here]
+    if len({p.resolve() for p in found}) != len(found):
+        raise UserError("run: the same run is given twice.")
+    return found
+
+
+def flatten(tree: PyTree) -> dict[str, np.ndarray]:
+    """The arrays of a tree by their path; random keys as their bits."""
+    leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(tree, eqx.is_array))
+    return {jax.tree_util.keystr(path): np.asarray(_bits(leaf)) for path, leaf in leaves}
+
+
+def unflatten(like: PyTree, arrays: dict[str, np.ndarray], source: str) -> Any:
+    """The tree shaped as `like`, with these arrays in it.
+
+    Raises UserError naming the first array that is missing, superfluous or of another shape.
+    """
+    is_array = lambda x: isinstance(x, jax.Array | jax.ShapeDtypeStruct | np.ndarray)
+    dynamic, static = eqx.partition(like, is_array)
+    leaves, treedef = jax.tree_util.tree_flatten_with_path(dynamic)
+    names = [jax.tree_util.keystr(path) for path, _ in leaves]
+    bits = [jax.eval_shape(_bits, leaf) for _, leaf in leaves]
+    store.expect(arrays, dict(zip(names, bits, strict=True)), source)
+    values = [
+        _from_bits(jnp.array(arrays[name]), leaf.dtype)
+        for name, (_, leaf) in zip(names, leaves, strict=True)
+    ]
+    return eqx.combine(treedef.unflatten(values), static)
+
+
+def _bits(leaf: jax.Array) -> jax.Array:
+    return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+
+
+def _from_bits(value: jax.Array, dtype: Any) -> jax.Array:
+    return jax.random.wrap_key_data(value) if jnp.issubdtype(dtype, jax.dtypes.prng_key) else value
+
+
+def versions() -> dict[str, str]:
+    """Of what a result depends on."""
+    found = {"python": platform.python_version(), "machine": platform.machine()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
