@@ -49,7 +49,9 @@ def parser() -> Parser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
-        p.add_argument("--json", action="store_true", help="print one JSON object on standard output")
+        p.add_argument(
+            "--json", action="store_true", help="print one JSON object on standard output"
+        )
         return p
 
     p = verb("demo", "train, evaluate and report the main task, from nothing to a film")
@@ -91,7 +93,9 @@ def parser() -> Parser:
     p.add_argument("run", type=Path, metavar="RUN", help="a run directory")
     p.add_argument("--episode", type=int, default=0, help="which of the evaluation starts")
     p.add_argument("--seed", type=int, default=0, help="of the starts (default 0)")
-    p.add_argument("--out", type=Path, default=None, help="where to put the film (default: the run)")
+    p.add_argument(
+        "--out", type=Path, default=None, help="where to put the film (default: the run)"
+    )
     p.add_argument("--task", default=None, help="the task, where it is your own code")
     p.add_argument("--algorithm", default=None, help="the algorithm, where it is your own code")
 

@@ -16,6 +16,8 @@ def paper(algorithm: MASAC) -> MASAC:
     return dataclasses.replace(algorithm, **plain)
 
 
+PRESETS = {"tuned": lambda algorithm: algorithm, "paper": paper}
+
 ALGORITHMS: dict[str, AbstractAlgorithm] = {
     "masac": MASAC(),
     "masac-lyapunov": MASAC(constraint=Lyapunov()),

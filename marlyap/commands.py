@@ -1,0 +1,382 @@
+"""What the verbs of the command line do."""
+
+import json
+import shlex
+import sys
+import time
+from argparse import Namespace
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from marlyap import config, film, store
+from marlyap.algorithm import AbstractAlgorithm
+from marlyap.algorithms import ALGORITHMS, PRESETS
+from marlyap.controllers import CONTROLLERS
+from marlyap.errors import UserError
+from marlyap.evaluate import Evaluation, compare, evaluate, pooled
+from marlyap.game import AbstractGame
+from marlyap.report import html
+from marlyap.run import Run, expand
+from marlyap.tasks import TASKS
+from marlyap.train import SCHEDULES, Trainer
+from marlyap.workers import train_all
+
+
+Result = tuple[dict[str, Any] | None, int]
+Overrides = dict[str, str]
+DEMO_STEPS = 204_800
+
+
+def train(args: Namespace, overrides: Overrides) -> Result:
+    """Make the runs, or open those to be resumed, and train them."""
+    if args.resume:
+        if args.task or args.algorithm:
+            game, algorithm = own_code(args, overrides)
+        else:
+            game = algorithm = None
+        runs = [Run.open(d, game, algorithm) for d in expand(args.resume)]
+    else:
+        if not args.task or not args.algorithm:
+            raise UserError("train: name a task and an algorithm, as in train rendezvous masac.")
+        runs = create(args, overrides)
+    code = train_all(runs, args)
+    state = [
+        {"run": str(r.directory), "seed": r.seed, "steps": r.steps_done, "finished": r.finished}
+        for r in runs
+    ]
+    say(f"{'Done' if code == 0 else 'Stopped'}: {', '.join(str(r.directory) for r in runs)}")
+    return {"runs": state}, code
+
+
+def create(args: Namespace, overrides: Overrides) -> list[Run]:
+    """One new run for each seed."""
+    game, algorithm, trainer = assemble(args, overrides)
+    names = {"task": args.task, "algorithm": args.algorithm, "preset": args.preset}
+    safe = lambda name: Path(name.rpartition(":")[2]).stem if ":" in name else name
+    out = args.out or Path("runs") / safe(args.task) / safe(args.algorithm)
+    places = [(out / f"seed{seed}", seed) for seed in seeds(args.seeds)]
+    return [Run.create(place, trainer, seed, names, args.force) for place, seed in places]
+
+
+def assemble(
+    args: Namespace, overrides: Overrides
+) -> tuple[AbstractGame, AbstractAlgorithm, Trainer]:
+    """Task, algorithm and schedule as asked for."""
+    if args.preset not in PRESETS:
+        raise UserError(
+            f"preset: '{args.preset}' is unknown; {config.suggest(args.preset, PRESETS)}"
+        )
+    game = config.load(args.task, AbstractGame)
+    algorithm = PRESETS[args.preset](config.load(args.algorithm, AbstractAlgorithm))
+    schedule = SCHEDULES[args.preset]
+    parts = {"task": game, "algorithm": algorithm, "schedule": schedule}
+    for path, text in overrides.items():
+        part, _, field = path.partition(".")
+        try:
+            parts[part] = config.override(parts[part], field, text)
+        except UserError as error:
+            raise UserError(f"--{part}.{error}") from None
+    if args.steps is not None:
+        parts["schedule"] = config.override(parts["schedule"], "steps", str(args.steps))
+    return (
+        parts["task"],
+        parts["algorithm"],
+        Trainer(parts["task"], parts["algorithm"], parts["schedule"]),
+    )
+
+
+def own_code(
+    args: Namespace, overrides: Overrides
+) -> tuple[AbstractGame | None, AbstractAlgorithm | None]:
+    """Task and algorithm that the user named because the run's are his own code."""
+    game = config.load(args.task, AbstractGame) if args.task else None
+    algorithm = config.load(args.algorithm, AbstractAlgorithm) if args.algorithm else None
+    for path, text in overrides.items():
+        part, _, field = path.partition(".")
+        if part != "task" or game is None:
+            raise UserError(f"--{path}: here only --task.FIELD beside --task can be set.")
+        game = config.override(game, field, text)
+    return game, algorithm
+
+
+def seeds(words: list[str]) -> list[int]:
+    """The seeds asked for: whole numbers, each once."""
+    try:
+        numbers = [int(w) for word in words for w in word.split(",")]
+    except ValueError:
+        raise UserError(f"seeds: {' '.join(words)} are not all whole numbers.") from None
+    if len(set(numbers)) != len(numbers):
+        raise UserError(f"seeds: {' '.join(words)} names a seed twice.")
+    if not all(0 <= n < 2**31 for n in numbers):
+        raise UserError(f"seeds: {' '.join(words)} must lie between 0 and 2147483647.")
+    return numbers
+
+
+def measure(args: Namespace, overrides: Overrides) -> Result:
+    """`evaluate`: every run and controller on the same fresh starts."""
+    if not 0 < args.confidence < 1:
+        raise UserError(f"confidence: {args.confidence} must lie between 0 and 1.")
+    game, algorithm = own_code(args, overrides)
+    found: list[tuple[str, str, Any, Evaluation]] = []
+    for word in args.runs:
+        if word in CONTROLLERS:
+            if game is None:
+                raise UserError(f"task: {word} needs --task, the task it is to be measured on.")
+            found.append(
+                (
+                    word,
+                    word,
+                    None,
+                    evaluate(game, CONTROLLERS[word](game), args.episodes, args.seed),
+                )
+            )
+            continue
+        if not Path(word).exists():
+            raise UserError(
+                f"run: there is no run or controller '{word}'; {config.suggest(word, CONTROLLERS)}"
+            )
+        for directory in expand([Path(word)]):
+            run = Run.open(directory, game, algorithm)
+            result = evaluate(run.game, run.controller(), args.episodes, args.seed)
+            found.append((str(directory), group(run), run, result))
+    rows = [
+        {"name": name, "group": g, "seed": run.seed if run else None} | e.summary(args.confidence)
+        for name, g, run, e in found
+    ]
+    for (_, _, run, _), row in zip(found, rows, strict=True):
+        if run:
+            store.write_text_atomic(
+                run.directory / "evaluation.json", json.dumps(row, indent=1) + "\n"
+            )
+    names = list(dict.fromkeys(g for _, g, _, _ in found))
+    together = {n: pooled([e for _, g, _, e in found if g == n]) for n in names}
+    groups = [{"group": n} | e.summary(args.confidence) for n, e in together.items()]
+    pairs = comparisons(found)
+    whole = pooled([e for *_, e in found]).summary(args.confidence)
+    if not args.json:
+        tabulate(rows, groups, pairs)
+    return whole | {
+        "start_seed": args.seed,
+        "runs": rows,
+        "groups": groups,
+        "comparisons": pairs,
+    }, 0
+
+
+def group(run: Run) -> str:
+    """Runs that differ in their seed alone belong together."""
+    preset = run.names["preset"]
+    return f"{run.names['task']} {run.names['algorithm']}" + (
+        f" ({preset})" if preset not in ("", "tuned") else ""
+    )
+
+
+def comparisons(found: list[tuple[str, str, Any, Evaluation]]) -> list[dict[str, Any]]:
+    """McNemar's test for every pair of different groups, on the starts they share."""
+    pairs = []
+    for i, (name_a, group_a, _, a) in enumerate(found):
+        for name_b, group_b, _, b in found[i + 1 :]:
+            if group_a != group_b and len(a.final) == len(b.final) and len(pairs) < 100:
+                pairs.append({"a": name_a, "b": name_b} | compare(a, b))
+    return pairs
+
+
+def tabulate(
+    rows: list[dict[str, Any]], groups: list[dict[str, Any]], pairs: list[dict[str, Any]]
+) -> None:
+    """The evaluation as a table on standard output."""
+    table = Table(
+        title=f"success within {rows[0]['radius']} m at the last step", title_justify="left"
+    )
+    for head in (
+        "run",
+        "episodes",
+        "success",
+        "interval",
+        "r=0.05",
+        "median m",
+        "95 % m",
+        "settled s",
+        "return",
+    ):
+        table.add_column(head, justify="left" if head == "run" else "right", no_wrap=head != "run")
+    several = len(rows) > len(groups)
+    for row in rows + (groups if several else []):
+        low, high = row["interval"]
+        number = lambda v, digits: "-" if v is None else f"{v:.{digits}f}"
+        table.add_row(
+            row.get("name") or f"all of {row['group']}",
+            str(row["episodes"]),
+            f"{100 * row['success_rate']:.1f} %",
+            f"{100 * low:.1f}-{100 * high:.1f} %",
+            f"{100 * row['radii'][0]['success_rate']:.1f} %",
+            number(row["final_distance"]["0.5"], 3),
+            number(row["final_distance"]["0.95"], 3),
+            number(row["settling_time"]["0.5"], 1),
+            f"{row['return_mean']:.2f}",
+        )
+    console = Console()
+    console.print(table)
+    for pair in pairs:
+        console.print(
+            f"{pair['a']} against {pair['b']}: only the first {pair['only_a']}, only the second {pair['only_b']}, McNemar p = {pair['p_value']:.2g}",
+            highlight=False,
+        )
+
+
+def report(args: Namespace, overrides: Overrides) -> Result:
+    """Write the HTML page and the pictures."""
+    game, algorithm = own_code(args, overrides)
+    runs = [Run.open(d, game, algorithm) for d in expand(args.runs)]
+    out = args.out or runs[0].directory / "report.html"
+    page = film.page(runs, args.episodes, args.seed, command=shlex.join(["marlyap", *sys.argv[1:]]))
+    store.write_text_atomic(out, html(page))
+    from marlyap import draw
+
+    pictures = [out.with_name(f"{out.stem}-{name}") for name in ("starts.png", "learning.png")]
+    draw.trajectories_png(page["films"], pictures[0])
+    draw.learning_curves_png(page["runs"], pictures[1])
+    say(f"Report: {out.resolve()}")
+    summary = {k: page["summary"][k] for k in ("episodes", "successes", "success_rate", "interval")}
+    return summary | {"report": str(out), "pictures": [str(p) for p in pictures]}, 0
+
+
+def watch(args: Namespace, overrides: Overrides) -> Result:
+    """Film one episode."""
+    game, algorithm = own_code(args, overrides)
+    run = Run.open(expand([args.run])[0], game, algorithm)
+    place = args.out or run.directory
+    if not place.is_dir():
+        raise UserError(f"out: there is no directory {place}.")
+    shot = film.one(run, args.episode, args.seed)
+    from marlyap import draw
+
+    gif, page = place / "film.gif", place / "film.html"
+    draw.film_gif(shot, gif)
+    store.write_text_atomic(page, html({"title": f"One episode of {run.title}", "films": [shot]}))
+    say(f"Film: {page.resolve()} and {gif.resolve()}")
+    return {"gif": str(gif), "html": str(page), "success": bool(shot["success"])}, 0
+
+
+def listing(args: Namespace, overrides: Overrides) -> Result:
+    """What there is, or the fields of one of them."""
+    if args.name:
+        return fields_of(args.name), 0
+    families: dict[str, dict[str, Any]] = {
+        "tasks": TASKS,
+        "algorithms": ALGORITHMS,
+        "controllers": CONTROLLERS,
+    }
+    result = {
+        title: {name: summary(thing) for name, thing in family.items()}
+        for title, family in families.items()
+    }
+    if not args.json:
+        console = Console()
+        for title, members in result.items():
+            table = Table(
+                title=title, title_justify="left", show_header=False, box=None, padding=(0, 2)
+            )
+            for name, text in members.items():
+                table.add_row(f"[bold]{name}[/]", text)
+            console.print(table, "")
+    return result, 0
+
+
+def summary(thing: Any) -> str:
+    """The first line of its documentation."""
+    cls = thing if isinstance(thing, type) else type(thing)
+    line = (cls.__doc__ or "").strip().splitlines()[0]
+    if isinstance(thing, AbstractGame):
+        n, who = thing.agents, len(thing.leaders)
+        limits = " and ".join(f"{u:g}" for u in thing.dynamics.limits)
+        line += f" [{n} agents, {who} leader{'s' * (who > 1)}, {thing.graph} graph, limits {limits}]".replace(
+            "[", "("
+        ).replace("]", ")")
+    elif isinstance(thing, AbstractAlgorithm):
+        line += (
+            f" Constraint: {config.show(thing.constraint)}." if hasattr(thing, "constraint") else ""
+        )
+    return line
+
+
+def fields_of(name: str) -> dict[str, Any]:
+    """Every field of a task or algorithm with its value, for overriding."""
+    family = AbstractGame if name in TASKS else AbstractAlgorithm
+    if name not in TASKS and name not in ALGORITHMS:
+        raise UserError(
+            f"name: there is no task or algorithm '{name}'; {config.suggest(name, [*TASKS, *ALGORITHMS])}"
+        )
+    rows = config.describe(config.load(name, family), config.WORDS[family])
+    table = Table(title=name, title_justify="left")
+    for head in ("option", "value", "meaning"):
+        table.add_column(head)
+    for option, value, note in rows:
+        table.add_row(f"--{option}", value, note)
+    if not sys.argv[1:].count("--json"):
+        Console().print(table)
+    return {f"--{option}": {"value": value, "meaning": note} for option, value, note in rows}
+
+
+def demo(args: Namespace, overrides: Overrides) -> Result:
+    """Train, evaluate and report the main task; what is trained already is kept."""
+    start = time.monotonic()
+    names = [args.out / f"seed{s}" for s in seeds(args.seeds)]
+    job = Namespace(
+        task="rendezvous",
+        algorithm="masac-lyapunov",
+        preset="tuned",
+        seeds=args.seeds,
+        out=args.out,
+        steps=args.steps or DEMO_STEPS,
+        force=args.again,
+        parallel="auto",
+        json=False,
+        worker=False,
+        device=None,
+    )
+    there = [d for d in names if (d / "run.json").is_file()]
+    if there and not args.again:
+        missing = [d for d in names if d not in there]
+        if missing:
+            raise UserError(
+                f"seeds: {missing[0]} is not there beside {there[0]}; add --again to train all anew."
+            )
+        runs = [Run.open(d) for d in names]
+        say(f"{args.out} holds these runs; going on with them. To train anew: demo --again")
+    else:
+        runs = create(job, overrides)
+    code = train_all([r for r in runs if not r.finished], job)
+    if code:
+        return None, code
+    out = args.out / "report.html"
+    result, _ = report(
+        Namespace(runs=names, out=out, episodes=500, seed=0, task=None, algorithm=None), {}
+    )
+    assert result is not None
+    low, high = result["interval"]
+    text = f"{result['successes']} of {result['episodes']} fresh starts succeeded: {100 * result['success_rate']:.1f} %"
+    print(
+        f"{text} (95 % interval {100 * low:.1f} to {100 * high:.1f} %), in {time.monotonic() - start:.0f} s.",
+        file=sys.stderr if args.json else sys.stdout,
+    )
+    return result | {"seconds": time.monotonic() - start}, 0
+
+
+def say(text: str) -> None:
+    """A line for the person; standard output is kept for results."""
+    print(text, file=sys.stderr)
+
+
+VERBS: dict[str, Callable[[Namespace, Overrides], Result]] = {
+    "demo": demo,
+    "train": train,
+    "evaluate": measure,
+    "report": report,
+    "watch": watch,
+    "list": listing,
+}

@@ -1,0 +1,162 @@
+"""Many seeds at once: one process a core on a CPU, one vmapped program on a GPU."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from argparse import Namespace
+from collections.abc import Iterable, Iterator
+from queue import Queue
+from typing import Any
+
+import jax
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from marlyap.errors import UserError
+from marlyap.fit import fit
+from marlyap.run import Run
+
+
+class Stop:
+    """Remembers the first signal, so that the loop can end in good order; the second ends at once."""
+
+    def __init__(self):
+        self.signal = 0
+        self.children: list[subprocess.Popen] = []
+
+    def __enter__(self) -> "Stop":
+        self.before = {s: signal.signal(s, self.catch) for s in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for s, handler in self.before.items():
+            signal.signal(s, handler)
+
+    def catch(self, number: int, _: object) -> None:
+        for child in self.children:
+            if child.poll() is None:
+                child.send_signal(number)
+        if self.signal and not self.children:
+            os._exit(128 + number)
+        if not self.signal and not os.environ.get("MARLYAP_WORKER"):
+            print("\nStopping at the next checkpoint; once more to stop at once.", file=sys.stderr)
+        self.signal = number
+
+    def __call__(self) -> bool:
+        return self.signal != 0
+
+    @property
+    def code(self) -> int:
+        return 128 + self.signal if self.signal else 0
+
+
+def train_all(runs: list[Run], args: Namespace) -> int:
+    """Train the runs that are not finished; returns 0, or 128 + the signal that stopped them."""
+    runs = [run for run in runs if not run.finished]
+    if not runs:
+        return 0
+    if args.parallel not in ("auto", "process", "vmap"):
+        raise UserError(f"parallel: '{args.parallel}' must be auto, process or vmap.")
+    vmapped = args.parallel == "vmap" or (
+        args.parallel == "auto" and jax.default_backend() != "cpu"
+    )
+    with Stop() as stop:
+        if args.worker:
+            for event in fit(runs, stop):
+                print(json.dumps(event), flush=True)
+        elif len(runs) == 1 or (vmapped and _alike(runs)):
+            _show(fit(runs, stop), runs)
+        else:
+            _show(_processes(runs, stop), runs)
+    if stop.signal:
+        where = " ".join(str(run.directory) for run in runs)
+        print(f"Saved. Go on with: marlyap train --resume {where}", file=sys.stderr)
+    return stop.code
+
+
+def _alike(runs: list[Run]) -> bool:
+    return all(r.trainer == runs[0].trainer and r.steps_done == runs[0].steps_done for r in runs)
+
+
+def _show(events: Iterable[dict[str, Any]], runs: list[Run]) -> None:
+    """A bar for each seed: steps, speed, return, success, time left."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TextColumn("{task.fields[text]}"),
+        TimeRemainingColumn(compact=True),
+    )
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        bars = {
+            r.seed: progress.add_task(f"seed {r.seed}", total=None, text="compiling") for r in runs
+        }
+        seen: dict[int, dict[str, Any]] = {}
+        for e in events:
+            if "warning" in e or "diverged" in e:
+                what = e.get("warning") or f"{e['diverged']} is not finite; this seed is given up"
+                console.print(f"seed {e['seed']}: {what}", highlight=False)
+                continue
+            first = seen.setdefault(e["seed"], e)
+            seconds = max(e["seconds"] - first["seconds"], 1e-9)
+            speed = (e["steps"] - first["steps"]) / seconds
+            success = e.get("success", first.get("last"))
+            first["last"] = success
+            text = f"{e['steps']:,} steps  {speed:,.0f}/s  return {e['return']:.2f}"
+            text += f"  success {100 * success:.1f} %" if success is not None else ""
+            progress.update(
+                bars[e["seed"]], total=e["iterations"], completed=e["iteration"], text=text
+            )
+            if not console.is_terminal and "success" in e:
+                console.print(f"seed {e['seed']}: {text}", highlight=False)
+
+
+def _processes(runs: list[Run], stop: Stop) -> Iterator[dict[str, Any]]:
+    """One process a core; each prints its events as JSON lines."""
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
+    waiting, free, queue = list(runs), list(cores), Queue()
+    active: dict[int, tuple[subprocess.Popen, int, Run]] = {}
+    while (waiting and not stop()) or active:
+        while waiting and free and not stop():
+            run, core = waiting.pop(0), free.pop(0)
+            child = _spawn(run, core)
+            stop.children.append(child)
+            active[child.pid] = (child, core, run)
+            threading.Thread(target=_listen, args=(child, queue), daemon=True).start()
+        pid, line = queue.get()
+        if line is not None:
+            yield json.loads(line)
+            continue
+        child, core, run = active.pop(pid)
+        stop.children.remove(child)
+        free.append(core)
+        code = child.wait()
+        if code not in (0, 130, 143):
+            for other, _, _ in active.values():
+                other.send_signal(signal.SIGTERM)
+            said = child.stderr.read().strip().removeprefix("marlyap: ") if child.stderr else ""
+            raise UserError(said.splitlines()[-1] if said else f"{run.directory}: training failed.")
+
+
+def _spawn(run: Run, core: int) -> subprocess.Popen:
+    command = [sys.executable, "-m", "marlyap", "train", "--worker", "--resume", str(run.directory)]
+    return subprocess.Popen(
+        command,
+        env=os.environ | {"MARLYAP_CORE": str(core), "MARLYAP_WORKER": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # Ctrl-C reaches the parent, which passes it on once
+    )
+
+
+def _listen(child: subprocess.Popen, queue: Queue) -> None:
+    assert child.stdout is not None
+    for line in child.stdout:
+        if line.startswith("{"):
+            queue.put((child.pid, line))
+    queue.put((child.pid, None))
