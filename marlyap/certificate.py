@@ -1,0 +1,221 @@
+"""The seam of every certificate: what is claimed, on what evidence, and the worst case found.
+
+A sampled certificate judges whole rollouts from fresh, independent starts: one rollout is one
+trial, and a rollout in which anything is not finite has failed. Bounds are exact (Clopper-Pearson).
+"""
+
+import abc
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, PyTree
+
+from marlyap.errors import UserError
+from marlyap.game import AbstractGame
+from marlyap.lyapunov_function import AbstractLyapunov
+from marlyap.rollout import Controller, rollout
+from marlyap.seeds import Purpose, stream
+from marlyap.statistics import lower_bound, trials_needed
+from marlyap.types import Key, Scalar, State, Trajectory
+
+
+Evidence = Literal["proved", "statistical", "observed"]
+CHUNK = 500_000  # agent-steps that are in memory at once
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """What one certificate found. `holds` is never more than its claim, evidence and scope say."""
+
+    name: str
+    claim: str  # in words
+    evidence: Evidence
+    holds: bool
+    bound: float | None  # what is claimed of the quantity in the claim
+    confidence: float | None  # over the sampling; None where nothing was sampled
+    scope: dict[str, Any]  # start distribution, horizon, disturbance
+    trials: int | None = None
+    successes: int | None = None
+    worst: dict[str, Any] | None = None  # a start that can be replayed, and its state
+    figures: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain JSON values; what is not finite is null."""
+        return plain(dataclasses.asdict(self))
+
+
+class Judgement(eqx.Module):
+    """What a certificate makes of one rollout."""
+
+    holds: Bool[Array, ""]
+    badness: Scalar  # larger is worse; it picks the worst case
+    figures: dict[str, Scalar]
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """The judgements of many rollouts, as NumPy arrays."""
+
+    holds: np.ndarray
+    badness: np.ndarray
+    figures: dict[str, np.ndarray]
+
+
+class AbstractCertificate(eqx.Module):
+    """The fields of a subclass say how much is asked: counts, region, confidence."""
+
+    confidence: eqx.AbstractVar[float]
+    evidence: eqx.AbstractClassVar[Evidence]
+
+    @abc.abstractmethod
+    def check(
+        self, game: AbstractGame, controller: Controller, V: AbstractLyapunov, seed: int
+    ) -> Verdict:
+        """Judge one controller. It does not raise when the controller fails."""
+
+
+Judge = Callable[[AbstractGame, AbstractLyapunov, Trajectory], Judgement]
+
+
+@eqx.filter_jit
+def _roll(
+    game: AbstractGame, controller: Controller, key: Key, indices: Array, steps: int
+) -> Trajectory:
+    def one(index: Array) -> Trajectory:
+        k_start, k_act = jax.random.split(jax.random.fold_in(key, index))
+        return rollout(game, controller, game.reset(k_start), k_act, steps)
+
+    return jax.vmap(one)(indices)
+
+
+@eqx.filter_jit
+def _judge(
+    judge: Judge, game: AbstractGame, V: AbstractLyapunov, seen: Trajectory, steps: int
+) -> Judgement:
+    def one(trajectory: Trajectory) -> Judgement:
+        trajectory = until(trajectory, steps)
+        found, sound = judge(game, V, trajectory), finite(trajectory)
+        badness = jnp.where(sound & ~jnp.isnan(found.badness), found.badness, jnp.inf)
+        return Judgement(found.holds & sound, badness, found.figures)
+
+    return jax.vmap(one)(seen)
+
+
+def judged(
+    judge: Judge,
+    game: AbstractGame,
+    controller: Controller,
+    V: AbstractLyapunov,
+    seed: int,
+    purpose: Purpose,
+    count: int,
+    steps: int,
+) -> Found:
+    """`judge` of `count` rollouts of `steps` steps, as NumPy arrays.
+
+    They are rolled in chunks, so that memory does not grow with `count`, and for a whole number of
+    horizons, so that certificates share what was compiled; the judge sees `steps` steps of it.
+    """
+    long = math.ceil(steps / game.horizon) * game.horizon
+    size = max(1, min(count, 1000, CHUNK // (game.agents * (long + 1))))
+    key, parts = stream(seed, purpose), []
+    for first in range(0, count, size):
+        seen = _roll(game, controller, key, jnp.arange(first, first + size), long)
+        parts.append(jax.tree.map(np.asarray, _judge(judge, game, V, seen, steps)))
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *map(vars, parts))
+    return Found(**joined)
+
+
+def until(trajectory: Trajectory, steps: int) -> Trajectory:
+    """The rollout as if it had stopped after `steps` steps."""
+    cut = lambda tree, end: jax.tree.map(lambda leaf: leaf[:end], tree)
+    parts = {k: cut(v, steps) for k, v in vars(trajectory).items() if k != "state"}
+    return Trajectory(state=cut(trajectory.state, steps + 1), **parts)
+
+
+def finite(tree: PyTree) -> Bool[Array, ""]:
+    """Whether every number in the tree is finite."""
+    numbers = [x for x in jax.tree.leaves(tree) if eqx.is_inexact_array(x)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in numbers]))
+
+
+def start_of(game: AbstractGame, seed: int, purpose: Purpose, episode: int) -> State:
+    """The start of one rollout: what a verdict's worst case names."""
+    k_start, _ = jax.random.split(jax.random.fold_in(stream(seed, purpose), episode))
+    return game.reset(k_start)
+
+
+def worst_of(
+    game: AbstractGame, seed: int, purpose: Purpose, found: Found, among: Any = None
+) -> dict[str, Any]:
+    """The rollout that failed worst, or came closest to failing, as a start to replay."""
+    badness = np.clip(found.badness.astype(float), -1e29, 1e29)
+    rank = np.where(found.holds, badness, badness + 1e30)
+    if among is not None:
+        rank = np.where(among, rank, -np.inf)
+    episode = int(np.argmax(rank))
+    start = start_of(game, seed, purpose, episode)
+    figures = {name: float(np.asarray(values)[episode]) for name, values in found.figures.items()}
+    return {
+        "seed": seed,
+        "purpose": purpose,
+        "episode": episode,
+        "failed": not bool(found.holds[episode]),
+        "badness": float(found.badness[episode]),
+        "state": {"x": np.asarray(start.x).tolist(), "goal": np.asarray(start.goal).tolist()},
+        "figures": figures,
+    }
+
+
+def enough(rollouts: int, share: float, confidence: float, what: str = "rollouts") -> None:
+    """Raise UserError unless `rollouts` without a failure could show the share asked for."""
+    needed = trials_needed(1.0 - share, confidence)
+    if rollouts < needed:
+        raise UserError(
+            f"{what}: {rollouts} cannot show a share of {share:g} at confidence {confidence:.6g}; "
+            f"at least {needed} are needed, and more if any fails."
+        )
+
+
+def at_least(successes: int, trials: int, share: float, confidence: float) -> tuple[float, bool]:
+    """The exact lower bound on the probability of success, and whether it reaches `share`."""
+    if trials == 0:
+        return 0.0, False
+    bound = float(lower_bound(successes, trials, confidence))
+    return bound, bound >= share
+
+
+def scope(game: AbstractGame, steps: int, disturbance: str = "none") -> dict[str, Any]:
+    """What a sampled claim is limited to."""
+    return {
+        "starts": f"the starts that {type(game).__name__}.reset draws",
+        "horizon_steps": steps,
+        "horizon_seconds": steps * game.dt,
+        "disturbance": disturbance,
+        "radius": game.radius,
+    }
+
+
+def plain(value: Any) -> Any:
+    """Modules, arrays and numbers as JSON values; what is not finite becomes null."""
+    if isinstance(value, eqx.Module):
+        kind = {"kind": type(value).__name__}
+        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+        return kind | plain(fields)
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, (np.ndarray, jax.Array)):
+        return plain(np.asarray(value).tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if isinstance(value, (str, int, bool, type(None))) else str(value)

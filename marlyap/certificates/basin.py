@@ -1,0 +1,90 @@
+"""C4: the largest level set of V from which no rollout failed, confirmed on fresh starts."""
+
+from typing import ClassVar
+
+import numpy as np
+
+from marlyap.certificate import (
+    AbstractCertificate,
+    Evidence,
+    Judgement,
+    Verdict,
+    at_least,
+    judged,
+    scope,
+    until,
+    worst_of,
+)
+from marlyap.certificates.reach import ReachAndStay
+from marlyap.statistics import bonferroni, clopper_pearson, trials_needed
+
+
+class Basin(AbstractCertificate):
+    """C4. v is the largest level without a failure below it in one set of rollouts. Then, on a
+    fresh set and with the confidence asked for,
+
+        P[ reach and stay | V(s_0) <= v ] >= bound   and   P[ V(s_0) <= v ] in `mass`,
+
+    with s_0 ~ rho. The fresh starts that fall into the level set are independent draws of rho
+    conditioned on it (rejection), so the first bound is exact. Reach and stay is that of C1'.
+    """
+
+    rollouts: int = 10_000  # fresh starts, of which those in the level set count
+    calibration: int = 10_000  # rollouts that choose v
+    stay: int = 40  # steps that have to be stayed
+    share: float = 0.98
+    confidence: float = 0.999
+    evidence: ClassVar[Evidence] = "statistical"
+
+    def check(self, game, controller, V, seed):
+        steps, n = game.horizon + max(self.stay, V.beyond), self.rollouts
+        each = bonferroni(self.confidence, 2)
+        first = judged(self.judge, game, controller, V, seed, "calibrate", self.calibration, steps)
+        level = largest_level(first.figures["V"], first.holds)
+        found = judged(self.judge, game, controller, V, seed, "certify", n, steps)
+        inside = found.figures["V"] <= level
+        m, k = int(inside.sum()), int((found.holds & inside).sum())
+        bound, shown = at_least(k, m, self.share, each)
+        mass = clopper_pearson(m, n, each)
+        needed = trials_needed(1 - self.share, each)
+        return Verdict(
+            name="basin",
+            claim=f"from at least a share {bound:.4f} of the starts with V <= {level:.4g} every "
+            f"agent is within {game.radius:g} m from {game.horizon * game.dt:g} s and stays for "
+            f"{self.stay * game.dt:g} s; they are at least a share {mass.low:.4f} of the starts",
+            evidence=self.evidence,
+            holds=shown,
+            bound=bound,
+            confidence=self.confidence,
+            scope=scope(game, game.horizon + self.stay) | {"starts_with": f"V <= {level:.6g}"},
+            trials=m,
+            successes=k,
+            worst=worst_of(game, seed, "certify", found, inside) if m else None,
+            figures={
+                "level": level,
+                "mass": [mass.low, mass.high],
+                "drawn": n,
+                "needed_inside": needed,
+                "share_asked": self.share,
+                "stay_steps": self.stay,
+                "V": type(V).__name__,
+                "failures_calibrating": int((~first.holds).sum()),
+            },
+        )
+
+    def judge(self, game, V, trajectory):
+        seen = until(trajectory, game.horizon + self.stay)
+        found = ReachAndStay(stay=self.stay).judge(game, V, seen)
+        value = V.along(game, trajectory, 1)[0]
+        return Judgement(found.holds, found.badness, {"V": value})
+
+
+def largest_level(values: np.ndarray, holds: np.ndarray) -> float:
+    """The largest V among the successes below every failure; minus infinity if there is none.
+
+    A start with V that is not finite lies in no level set.
+    """
+    known = np.isfinite(values)
+    failing = np.min(values[known & ~holds], initial=np.inf)
+    below = values[known & holds & (values < failing)]
+    return float(np.max(below, initial=-np.inf))

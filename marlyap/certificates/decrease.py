@@ -1,0 +1,84 @@
+"""C2: does V fall along every step until the team has arrived?"""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from marlyap.certificate import (
+    AbstractCertificate,
+    Evidence,
+    Judgement,
+    Verdict,
+    at_least,
+    enough,
+    judged,
+    scope,
+    worst_of,
+)
+
+
+class Decrease(AbstractCertificate):
+    """C2. With the confidence asked for, over the sampling of starts s_0 ~ rho,
+
+        P[ tau <= H, and V(s_{t+1}) - V(s_t) <= -beta c_rho(s_t) for every t < tau ] >= bound,
+
+    with tau the first time at which the game is in its ball of success. A rollout that never gets
+    there has failed, however V behaves. One rollout is one trial: its transitions depend on each
+    other, so the share of transitions that violate is reported without an interval of its own.
+    """
+
+    rollouts: int = 10_000
+    beta: float = 0.02  # the share of c_rho by which V has to fall in a step
+    share: float = 0.98
+    confidence: float = 0.999
+    evidence: ClassVar[Evidence] = "statistical"
+
+    def check(self, game, controller, V, seed):
+        enough(self.rollouts, self.share, self.confidence)
+        H, n = game.horizon, self.rollouts
+        found = judged(self.judge, game, controller, V, seed, "certify", n, H + V.beyond)
+        k = int(found.holds.sum())
+        bound, holds = at_least(k, n, self.share, self.confidence)
+        steps, bad = (float(np.nansum(found.figures[name])) for name in ("steps", "violations"))
+        return Verdict(
+            name="decrease",
+            claim=f"from at least a share {bound:.4f} of the starts V falls by {self.beta:g} of "
+            f"the cost in every step until the ball of {game.radius:g} m is entered, which "
+            f"happens within {H * game.dt:g} s",
+            evidence=self.evidence,
+            holds=holds,
+            bound=bound,
+            confidence=self.confidence,
+            scope=scope(game, H),
+            trials=n,
+            successes=k,
+            worst=worst_of(game, seed, "certify", found),
+            figures={
+                "share_asked": self.share,
+                "beta": self.beta,
+                "V": type(V).__name__,
+                "transitions_violating": bad / max(steps, 1.0),
+                "entered": int(np.sum(found.figures["entered"] > 0)),
+            },
+        )
+
+    def judge(self, game, V, trajectory):
+        H = game.horizon
+        inside = jax.vmap(game.success)(jax.tree.map(lambda leaf: leaf[: H + 1], trajectory.state))
+        before = jnp.cumsum(inside[:-1]) == 0  # t < tau
+        values = V.along(game, trajectory, H + 1)
+        cost = jax.vmap(lambda s: V.cost(game, s))(trajectory.state)[:H]
+        excess = values[1:] - values[:-1] + self.beta * cost
+        excess = jnp.where(jnp.isnan(excess), jnp.inf, excess)
+        violated = before & ~(excess <= 0)
+        entered = jnp.any(inside)
+        worst = jnp.max(jnp.where(before, excess, -jnp.inf))
+        badness = jnp.where(entered, worst, jnp.inf)
+        figures = {
+            "steps": jnp.sum(before).astype(float),
+            "violations": jnp.sum(violated).astype(float),
+            "entered": entered.astype(float),
+        }
+        return Judgement(entered & ~jnp.any(violated), badness, figures)

@@ -1,0 +1,87 @@
+"""C5: bounds that hold for all but a few starts, whatever the distribution."""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from marlyap.certificate import (
+    AbstractCertificate,
+    Evidence,
+    Judgement,
+    Verdict,
+    judged,
+    scope,
+    worst_of,
+)
+from marlyap.errors import UserError
+from marlyap.statistics import bonferroni, quantile_upper_bound, trials_needed
+
+
+NAMES = ("final_distance", "settling_time", "largest_rise")
+
+
+class Quantiles(AbstractCertificate):
+    """C5. With the confidence asked for, for all three together and over s_0 ~ rho,
+
+        P[ distance at H <= d ] >= q,
+        P[ settling time <= t ] >= q,
+        P[ largest rise of V <= w ] >= q,
+
+    by order statistics (a tolerance interval). The settling time is the time from which every
+    agent is within the radius until H, and infinite if there is none; the largest rise is that of
+    V from any earlier to any later state. What is not finite counts as infinite.
+    """
+
+    rollouts: int = 10_000
+    q: float = 0.95
+    confidence: float = 0.999
+    evidence: ClassVar[Evidence] = "statistical"
+
+    def check(self, game, controller, V, seed):
+        each = bonferroni(self.confidence, len(NAMES))
+        needed = trials_needed(1 - self.q, each)
+        if self.rollouts < needed:
+            raise UserError(
+                f"rollouts: {self.rollouts} cannot bound the {self.q:g}-quantile at confidence "
+                f"{each:.6g}; at least {needed} are needed."
+            )
+        H, n = game.horizon, self.rollouts
+        found = judged(self.judge, game, controller, V, seed, "certify", n, H + V.beyond)
+        sample = {
+            name: np.where(found.holds & ~np.isnan(v), v, np.inf)
+            for name, v in found.figures.items()
+        }
+        bounds = {name: quantile_upper_bound(sample[name], self.q, each) for name in NAMES}
+        say = lambda name: f"{bounds[name]:.4g}" if np.isfinite(bounds[name]) else "unbounded"
+        return Verdict(
+            name="quantiles",
+            claim=f"from at least a share {self.q:g} of the starts the final distance is at most "
+            f"{say('final_distance')} m; the same share settles within {say('settling_time')} s; "
+            f"and for the same share V never rises by more than {say('largest_rise')}",
+            evidence=self.evidence,
+            holds=bool(np.all(np.isfinite(list(bounds.values())))),
+            bound=bounds["final_distance"],
+            confidence=self.confidence,
+            scope=scope(game, H),
+            trials=n,
+            worst=worst_of(game, seed, "certify", found),
+            figures={"q": self.q, "bounds": bounds, "V": type(V).__name__},
+        )
+
+    def judge(self, game, V, trajectory):
+        H = game.horizon
+        states = jax.tree.map(lambda leaf: leaf[: H + 1], trajectory.state)
+        distance = jnp.max(jax.vmap(game.distance)(states), axis=1)
+        inside = jax.vmap(game.success)(states)
+        stays = jnp.cumprod(inside[::-1])[::-1].astype(bool)
+        settled = jnp.where(stays[-1], jnp.argmax(stays) * game.dt, jnp.inf)
+        values = V.along(game, trajectory, H + 1)
+        rise = jnp.max(values - jax.lax.cummin(values))
+        figures = {
+            "final_distance": distance[-1],
+            "settling_time": settled,
+            "largest_rise": rise,
+        }
+        return Judgement(jnp.asarray(True), distance[-1], figures)

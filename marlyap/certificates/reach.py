@@ -1,0 +1,101 @@
+"""C1 and C1': does the team arrive, and does it stay?"""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from marlyap.certificate import (
+    AbstractCertificate,
+    Evidence,
+    Judgement,
+    Verdict,
+    at_least,
+    enough,
+    judged,
+    scope,
+    worst_of,
+)
+
+
+class Reach(AbstractCertificate):
+    """C1. With the confidence asked for, over the sampling of starts s_0 ~ rho,
+
+        P[ distance_i(s_H) <= r for every agent i ] >= bound,
+
+    with H the game's horizon and r its radius. It says nothing of what happens after H.
+    """
+
+    rollouts: int = 10_000
+    share: float = 0.98  # the probability that has to be shown
+    confidence: float = 0.999
+    evidence: ClassVar[Evidence] = "statistical"
+
+    def check(self, game, controller, V, seed):
+        enough(self.rollouts, self.share, self.confidence)
+        H, n = game.horizon, self.rollouts
+        found = judged(self.judge, game, controller, V, seed, "certify", n, H)
+        k = int(found.holds.sum())
+        bound, holds = at_least(k, n, self.share, self.confidence)
+        return Verdict(
+            name="reach",
+            claim=f"from at least a share {bound:.4f} of the starts every agent is within "
+            f"{game.radius:g} m of its goal at {H * game.dt:g} s",
+            evidence=self.evidence,
+            holds=holds,
+            bound=bound,
+            confidence=self.confidence,
+            scope=scope(game, H),
+            trials=n,
+            successes=k,
+            worst=worst_of(game, seed, "certify", found),
+            figures={"share_asked": self.share},
+        )
+
+    def judge(self, game, V, trajectory):
+        last = jax.tree.map(lambda leaf: leaf[-1], trajectory.state)
+        distance = jnp.max(game.distance(last))
+        return Judgement(game.success(last), distance, {"final_distance": distance})
+
+
+class ReachAndStay(AbstractCertificate):
+    """C1'. With the confidence asked for, over the sampling of starts s_0 ~ rho,
+
+        P[ there is tau <= H: distance_i(s_t) <= r for all i and tau <= t <= H + S ] >= bound,
+
+    which is to be inside at every step from H to H + S. It says nothing of what comes after H + S.
+    """
+
+    rollouts: int = 10_000
+    stay: int = 40  # S, steps
+    share: float = 0.98
+    confidence: float = 0.999
+    evidence: ClassVar[Evidence] = "statistical"
+
+    def check(self, game, controller, V, seed):
+        enough(self.rollouts, self.share, self.confidence)
+        steps, n = game.horizon + self.stay, self.rollouts
+        found = judged(self.judge, game, controller, V, seed, "certify", n, steps)
+        k = int(found.holds.sum())
+        bound, holds = at_least(k, n, self.share, self.confidence)
+        return Verdict(
+            name="reach-and-stay",
+            claim=f"from at least a share {bound:.4f} of the starts every agent is within "
+            f"{game.radius:g} m of its goal from {game.horizon * game.dt:g} s at the latest "
+            f"until {steps * game.dt:g} s",
+            evidence=self.evidence,
+            holds=holds,
+            bound=bound,
+            confidence=self.confidence,
+            scope=scope(game, steps),
+            trials=n,
+            successes=k,
+            worst=worst_of(game, seed, "certify", found),
+            figures={"share_asked": self.share, "stay_steps": self.stay},
+        )
+
+    def judge(self, game, V, trajectory):
+        late = jax.tree.map(lambda leaf: leaf[game.horizon :], trajectory.state)
+        farthest = jnp.max(jax.vmap(game.distance)(late))
+        inside = jnp.all(jax.vmap(game.success)(late))
+        return Judgement(inside, farthest, {"farthest": farthest})

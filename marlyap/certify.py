@@ -1,0 +1,148 @@
+"""Every certificate of one controller, together: shared confidence, one file, fixed beforehand."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from marlyap import store
+from marlyap.certificate import AbstractCertificate, plain
+from marlyap.errors import UserError
+from marlyap.game import AbstractGame
+from marlyap.lyapunov_function import AbstractLyapunov, CostSum, require_zero
+from marlyap.rollout import Controller
+from marlyap.seeds import stream
+from marlyap.statistics import bonferroni
+
+
+KIND = "certificate"
+
+
+def certify(
+    game: AbstractGame,
+    controller: Controller,
+    certificates: Mapping[str, AbstractCertificate],
+    seed: int,
+    confidence: float,
+    *,
+    V: AbstractLyapunov | None = None,
+    checkpoints: int = 1,
+    policy: str | None = None,
+) -> dict[str, Any]:
+    """The verdicts of all `certificates`, true together with `confidence`; `holds` if all hold.
+
+    Each sampled one is asked at 1 - (1 - confidence) / (claims * checkpoints) (Bonferroni), with
+    `checkpoints` the number of controllers among which this one was or will be chosen by
+    certificates. V is by default the T-step cost sum outside a ball of half the radius. `policy`
+    is the hash that the controller was declared with.
+
+    Raises UserError if V is not 0 on the target set, if there are too few rollouts for the
+    confidence asked for, or if the controller is not the one declared.
+    """
+    if not certificates:
+        raise UserError("certificates: there must be at least one.")
+    digest = policy_hash(controller)
+    if policy is not None and policy != digest:
+        raise UserError(
+            f"policy: its hash is {digest[:12]}, not the declared {policy[:12]}; a certificate is "
+            "for a policy that was fixed beforehand."
+        )
+    V = CostSum(controller, ball=game.radius / 2) if V is None else V
+    require_zero(game, V, stream(seed, "calibrate"))
+    sampled = sum(c.evidence == "statistical" for c in certificates.values())
+    each = bonferroni(confidence, max(1, sampled) * checkpoints)
+    asked = {name: dataclasses.replace(c, confidence=each) for name, c in certificates.items()}
+    verdicts = {name: c.check(game, controller, V, seed) for name, c in asked.items()}
+    return {
+        "schema": 1,
+        "holds": all(v.holds for v in verdicts.values()),
+        "confidence": confidence,
+        "confidence_each": each,
+        "checkpoints": checkpoints,
+        "seed": seed,
+        "policy": digest,
+        "game": plain(game),
+        "controller": plain(_without_arrays(controller)),
+        "V": plain(_without_arrays(V)),
+        "certificates": {name: plain(c) for name, c in asked.items()},
+        "verdicts": {name: verdict.as_dict() for name, verdict in verdicts.items()},
+    }
+
+
+def save(
+    directory: Path,
+    result: Mapping[str, Any],
+    game: AbstractGame,
+    controller: Controller,
+    V: AbstractLyapunov | None = None,
+    *,
+    replace: bool = False,
+) -> None:
+    """Store a result of `certify` with all that an independent checker needs.
+
+    That is the starts of the rollouts, the arrays of the controller and of V, and the graph.
+    """
+    if policy_hash(controller) != result["policy"]:
+        raise UserError("policy: this controller is not the one that was certified.")
+    V = CostSum(controller, ball=game.radius / 2) if V is None else V
+    count = max((c.get("rollouts", 0) for c in result["certificates"].values()), default=0)
+    arrays = {f"starts/{k}": v for k, v in starts(game, result["seed"], count).items()}
+    arrays |= {f"controller/{k}": v for k, v in named_arrays(controller).items()}
+    arrays |= {f"V/{k}": v for k, v in named_arrays(V).items()}
+    arrays |= {"graph/slots": game.slots, "graph/linked": game.adjacency, "graph/leads": game.leads}
+    arrays = {k: np.asarray(v) for k, v in arrays.items()}
+    meta = plain(dict(result)) | {"starts_sha256": starts_hash(arrays)}
+    store.write(Path(directory), KIND, arrays, meta, replace=replace)
+
+
+def starts_hash(arrays: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 of the bytes of the recorded starts."""
+    parts = (np.ascontiguousarray(arrays[k]).tobytes() for k in ("starts/x", "starts/goal"))
+    return hashlib.sha256(b"".join(parts)).hexdigest()
+
+
+@eqx.filter_jit
+def _starts(game: AbstractGame, key: jax.Array, indices: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def one(index):
+        k_start, _ = jax.random.split(jax.random.fold_in(key, index))
+        state = game.reset(k_start)
+        return state.x, state.goal
+
+    return jax.vmap(one)(indices)
+
+
+def starts(game: AbstractGame, seed: int, count: int) -> dict[str, np.ndarray]:
+    """The starts that the sampled certificates judge, in their order."""
+    x, goal = _starts(game, stream(seed, "certify"), np.arange(max(count, 1)))
+    return {"x": np.asarray(x), "goal": np.asarray(goal)}
+
+
+def policy_hash(controller: Controller) -> str:
+    """SHA-256 of every number and word the controller is made of."""
+    numbers = named_arrays(controller)
+    leaves = jax.tree_util.tree_flatten_with_path(controller)[0]
+    words = {"kind": type(controller).__name__} | {
+        _name(path): leaf for path, leaf in leaves if isinstance(leaf, (str, int, float, bool))
+    }
+    text = json.dumps(words, sort_keys=True).encode()
+    return store.hash_arrays(numbers | {"words": np.frombuffer(text, np.uint8)})
+
+
+def named_arrays(tree: Any) -> dict[str, np.ndarray]:
+    """The arrays of a module by their path, such as policy.pi.net.layers.0.weight."""
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {_name(path): np.asarray(leaf) for path, leaf in leaves if eqx.is_array(leaf)}
+
+
+def _name(path: Any) -> str:
+    return ".".join(str(getattr(p, "name", getattr(p, "idx", getattr(p, "key", p)))) for p in path)
+
+
+def _without_arrays(tree: Any) -> Any:
+    return eqx.filter(tree, eqx.is_array, inverse=True)

@@ -1,0 +1,141 @@
+"""The functions V that certificates judge by: each zero on the target set, or in a ball around it.
+
+The first two need no network and serve any controller, the hand-written too.
+"""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from marlyap.errors import UserError
+from marlyap.game import AbstractGame
+from marlyap.nets import LyapunovNet, NormNet
+from marlyap.rollout import Controller, rollout
+from marlyap.types import Scalar, State, Trajectory
+
+
+class AbstractLyapunov(eqx.Module):
+    """V(s) >= 0. It has to fall by a share of c_rho(s), the mean of max(0, distance_i - rho)."""
+
+    ball: eqx.AbstractVar[float]  # rho (m)
+    beyond: eqx.AbstractVar[int]  # how many steps past a state `along` has to see
+
+    @abc.abstractmethod
+    def value(self, game: AbstractGame, state: State) -> Scalar:
+        """V(s)."""
+
+    @abc.abstractmethod
+    def along(
+        self, game: AbstractGame, trajectory: Trajectory, time: int
+    ) -> Float[Array, "{time}"]:
+        """V of the first `time` states of a rollout with at least `beyond` states after them."""
+
+    def cost(self, game: AbstractGame, state: State) -> Scalar:
+        """c_rho(s)."""
+        return jnp.mean(jax.nn.relu(game.distance(state) - self.ball))
+
+
+class CostSum(AbstractLyapunov):
+    """V(s) = sum_{k<T} c_rho(s_k) along the closed loop from s: the T-step cost sum, network-free.
+
+    Along a rollout of the same controller V(s_{t+1}) - V(s_t) = c_rho(s_{t+T}) - c_rho(s_t).
+    """
+
+    controller: Controller  # deterministic, without memory
+    T: int = 20  # steps
+    ball: float = 0.0  # rho (m)
+
+    @property
+    def beyond(self) -> int:
+        return self.T
+
+    def value(self, game, state):
+        seen = rollout(game, self.controller, state, jax.random.key(0), self.T)
+        return self.along(game, seen, 1)[0]
+
+    def along(self, game, trajectory, time):
+        cost = jax.vmap(lambda s: self.cost(game, s))(trajectory.state)
+        window = jnp.arange(time)[:, None] + jnp.arange(self.T)[None, :]
+        return jnp.sum(cost[window], axis=1)
+
+
+class Quadratic(AbstractLyapunov):
+    """V(s) = sum_i e_i' P e_i, with e_i zero exactly on the target set (`game.errors`)."""
+
+    P: Float[Array, "error error"]
+    ball: float = 0.0
+    beyond: int = 0
+
+    def value(self, game, state):
+        e = game.errors(state)
+        return jnp.sum((e @ self.P) * e)
+
+    def along(self, game, trajectory, time):
+        return pointwise(self, game, trajectory, time)
+
+
+class Norm(AbstractLyapunov):
+    """V(s) of a trained `NormNet`: zero on the target set, positive elsewhere by construction."""
+
+    net: NormNet
+    ball: float = 0.0
+    beyond: int = 0
+
+    def value(self, game, state):
+        return self.net(game.features(state))
+
+    def along(self, game, trajectory, time):
+        return pointwise(self, game, trajectory, time)
+
+
+class ActionValue(AbstractLyapunov):
+    """V(s) = L(s, mu(s)) of a trained `LyapunovNet` and a deterministic controller mu.
+
+    Nothing makes it zero on the target set; `require_zero` decides whether it may be used.
+    """
+
+    net: LyapunovNet
+    controller: Controller
+    ball: float = 0.0
+    beyond: int = 0
+
+    def value(self, game, state):
+        return self.net(game.features(state), self.controller(state, jax.random.key(0)))
+
+    def along(self, game, trajectory, time):
+        return pointwise(self, game, trajectory, time)
+
+
+def pointwise(
+    V: AbstractLyapunov, game: AbstractGame, trajectory: Trajectory, time: int
+) -> Float[Array, "{time}"]:
+    """V of each of the first `time` states on its own."""
+    states = jax.tree.map(lambda leaf: leaf[:time], trajectory.state)
+    return jax.vmap(lambda s: V.value(game, s))(states)
+
+
+def at_target(game: AbstractGame, state: State) -> State:
+    """The same episode with every agent at rest on its goal, headings as they were."""
+    angle = state.x[:, 2] if "psi" in game.dynamics.names else jnp.zeros(game.agents)
+    return eqx.tree_at(lambda s: s.x, state, jax.vmap(game.dynamics.rest)(state.goal, angle))
+
+
+@eqx.filter_jit
+def _values(V: AbstractLyapunov, game: AbstractGame, keys: Array) -> tuple[Array, Array]:
+    starts = jax.vmap(game.reset)(keys)
+    value = jax.vmap(lambda s: V.value(game, s))
+    return value(jax.vmap(lambda s: at_target(game, s))(starts)), value(starts)
+
+
+def require_zero(game: AbstractGame, V: AbstractLyapunov, key: Array) -> None:
+    """Raise UserError unless V is 0 on the target set, to 1e-5 of what it is at the starts."""
+    there, starts = _values(V, game, jax.random.split(key, 64))
+    worst, usual = float(jnp.max(jnp.abs(there))), float(jnp.median(jnp.abs(starts)))
+    if not worst <= 1e-5 * max(usual, 1e-12):
+        raise UserError(
+            f"V: {type(V).__name__} is {worst:.3g} on the target set, where it must be 0 (it is "
+            f"{usual:.3g} at a usual start); take another V, or one that is 0 in a ball."
+        )
