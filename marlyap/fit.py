@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -11,9 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from marlyap import store
+from marlyap.algorithm import AbstractAlgorithm
 from marlyap.errors import UserError
-from marlyap.run import Run
-from marlyap.train import Carry, Trainer
+from marlyap.game import AbstractGame
+from marlyap.nets import LyapunovNet, NormNet
+from marlyap.rollout import Decentralised, Policy
+from marlyap.run import Run, begin
+from marlyap.train import Carry, Schedule, Trainer
 
 
 SHARE = 0.02  # of the training time that checkpoints may take
@@ -45,31 +50,82 @@ def _fit(runs: list[Run], stop: Callable[[], bool]) -> Iterator[dict[str, Any]]:
         yield from ({"seed": run.seed, "warning": w} for w in warnings)
     carry = _stack([carry for carry, _, _ in loaded])
     before, clock = max(s for _, s, _ in loaded), time.monotonic()
-    done, saved = int(np.min(carry.iteration)), _Saved(clock)
-    alive = [True] * len(runs)
+    saved, alive = _Saved(clock), [True] * len(runs)
 
+    for done, carry, rows in advance(trainer, carry, stop):
+        seconds = before + time.monotonic() - clock
+        for i, run in enumerate(runs):
+            line = _line(trainer, run.seed, done, seconds, rows, i)
+            fault = _fault(line)
+            if fault and alive[i]:
+                alive[i] = False
+                yield {"seed": run.seed, "iteration": done, "diverged": fault}
+                if not any(alive):
+                    raise Diverged(_advice(fault, line) + f" in {run.directory}.")
+            if alive[i]:
+                run.log(line)
+                yield line | {"iterations": trainer.iterations}
+        if saved.due():
+            saved.save(runs, carry, alive, seconds)
+    saved.save(runs, carry, alive, before + time.monotonic() - clock)
+
+
+def advance(
+    trainer: Trainer, carry: Carry, stop: Callable[[], bool] = lambda: False
+) -> Iterator[tuple[int, Carry, dict[str, np.ndarray]]]:
+    """Iterate to the end or until `stop()`; yields (iterations done, carry, what the log wants).
+
+    Every array of `carry` has a leading axis of runs, and so have the arrays of the log. The carry
+    that goes in is used up.
+    """
+    done = int(np.min(carry.iteration))
     while done < trainer.iterations and not stop():
         carry, info = _iterate(trainer, carry)
         done += 1
         if done % trainer.schedule.judge_every == 0 or done == trainer.iterations:
             carry, look = _judge(trainer, carry)
             info |= look
-        rows = jax.tree.map(np.asarray, info)
-        seconds = before + time.monotonic() - clock
-        for i, run in enumerate(runs):
-            line = _line(trainer, run, done, seconds, {k: float(v[i]) for k, v in rows.items()})
-            fault = _fault(line)
-            if fault and alive[i]:
-                alive[i] = False
-                yield {"seed": run.seed, "iteration": done, "diverged": fault}
-            if alive[i]:
-                run.log(line)
-                yield line | {"iterations": trainer.iterations}
-        if not any(alive):
-            raise Diverged(_fault_advice(line, runs[0]))
-        if saved.due():
-            saved.save(runs, carry, alive, seconds)
-    saved.save(runs, carry, alive, before + time.monotonic() - clock)
+        yield done, carry, jax.tree.map(np.asarray, info)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What training in memory leaves: the policy, its Lyapunov function if any, and the log."""
+
+    policy: Policy
+    lyapunov: LyapunovNet | NormNet | None
+    game: AbstractGame
+    history: list[dict[str, Any]]
+
+    @property
+    def controller(self) -> Decentralised:
+        """The policy as a controller of its game, to be evaluated or certified."""
+        return Decentralised(self.policy, self.game)
+
+
+def train(
+    game: AbstractGame,
+    algorithm: AbstractAlgorithm,
+    schedule: Schedule = Schedule(),
+    seed: int = 0,
+    on_iteration: Callable[[dict[str, Any]], None] | None = None,
+) -> Trained:
+    """Train one team in memory; nothing is written. For long trainings use `Run` and `fit`.
+
+    `on_iteration` is given one dict an iteration. Raises Diverged (a UserError) when a number
+    stops being finite.
+    """
+    trainer, history, clock = Trainer(game, algorithm, schedule), [], time.monotonic()
+    carry = _stack([begin(trainer, seed)])
+    for done, carry, rows in advance(trainer, carry):
+        line = _line(trainer, seed, done, time.monotonic() - clock, rows, 0)
+        if fault := _fault(line):
+            raise Diverged(_advice(fault, line) + ".")
+        history.append(line)
+        if on_iteration:
+            on_iteration(line)
+    last = _row(carry, 0)
+    return Trained(last.best, algorithm.lyapunov(last.learner), game, history)
 
 
 class _Saved:
@@ -85,7 +141,7 @@ class _Saved:
         start = time.monotonic()
         for i, run in enumerate(runs):
             if alive[i]:
-                run.save(jax.tree.map(lambda x: x[i] if eqx.is_array(x) else x, carry), seconds)
+                run.save(_row(carry, i), seconds)
         self.at = time.monotonic()
         self.cost = self.at - start
 
@@ -96,12 +152,15 @@ def _stack(carries: list[Carry]) -> Carry:
     return jax.tree.map(join, *carries)
 
 
+def _row(carry: Carry, i: int) -> Carry:
+    return jax.tree.map(lambda x: x[i] if eqx.is_array(x) else x, carry)
+
+
 def _each(f: Callable[[Carry], Any], carry: Carry) -> Any:
     """`f` for every run: vmapped only when there are several, since a batch of one costs speed."""
     if carry.iteration.shape[0] > 1:
         return eqx.filter_vmap(f)(carry)
-    single = jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, carry)
-    return jax.tree.map(lambda x: x[None] if eqx.is_array(x) else x, f(single))
+    return jax.tree.map(lambda x: x[None] if eqx.is_array(x) else x, f(_row(carry, 0)))
 
 
 @eqx.filter_jit(donate="all-except-first")
@@ -115,30 +174,34 @@ def _judge(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
 
 
 def _line(
-    trainer: Trainer, run: Run, done: int, seconds: float, numbers: dict[str, float]
+    trainer: Trainer, seed: int, done: int, seconds: float, rows: dict[str, np.ndarray], i: int
 ) -> dict[str, Any]:
+    """One line of the log."""
     return {
-        "seed": run.seed,
+        "seed": seed,
         "iteration": done,
         "steps": done * trainer.steps_per_iteration,
         "updates": done * trainer.updates_per_iteration,
         "seconds": round(seconds, 3),
-    } | numbers
+    } | {name: float(values[i]) for name, values in rows.items()}
+
+
+FROM_TASK = ("obs", "features", "reward", "cost")
 
 
 def _fault(line: dict[str, Any]) -> str | None:
     """What is not finite: what the task gave before what the algorithm made of it."""
-    for name in ("obs", "features", "reward", "cost", "action"):
+    for name in (*FROM_TASK, "action"):
         if line.get(f"bad_{name}", 0) > 0:
             return name
     return next((k for k, v in line.items() if not np.isfinite(v)), None)
 
 
-def _fault_advice(line: dict[str, Any], run: Run) -> str:
-    fault = _fault(line)
-    who = "the task returned" if fault in ("obs", "features", "reward", "cost") else "training made"
-    mend = "mend the task" if who.startswith("the task") else "lower the learning rates"
+def _advice(fault: str, line: dict[str, Any]) -> str:
+    by_task = fault in FROM_TASK
     return (
-        f"{fault}: {who} a number that is not finite in iteration {line['iteration']} "
-        f"(seed {line['seed']}); {mend} and go on from the last checkpoint in {run.directory}."
+        f"{fault}: {'the task returned' if by_task else 'training made'} a number that is not "
+        f"finite in iteration {line['iteration']} (seed {line['seed']}); "
+        f"{'mend the task' if by_task else 'lower the learning rates'} and go on from the last "
+        "checkpoint"
     )

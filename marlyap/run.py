@@ -138,10 +138,6 @@ class Run:
     def finished(self) -> bool:
         return self.steps_done >= self.trainer.iterations * self.trainer.steps_per_iteration
 
-    def begin(self) -> Carry:
-        """The state of a fresh run."""
-        return _begin(self.trainer, stream(self.seed, "train"))
-
     def save(self, carry: Carry, seconds: float) -> None:
         """Checkpoint everything, and hand out the best policy with its Lyapunov function."""
         self.checkpoints.save(int(carry.iteration), flatten(carry), {"seconds": seconds})
@@ -150,9 +146,9 @@ class Run:
         store.write(self.directory / "policy", "policy", flatten(handed), meta, replace=True)
 
     def load(self) -> tuple[Carry, float, tuple[str, ...]]:
-        """The newest sound checkpoint, the seconds spent so far, and warnings about unsound ones."""
+        """The newest sound checkpoint, the seconds spent until then, and warnings."""
         if not self.checkpoints.steps():
-            return self.begin(), 0.0, ()
+            return begin(self.trainer, self.seed), 0.0, ()
         saved = self.checkpoints.latest()
         like = eqx.filter_eval_shape(self.trainer.begin, jax.random.key(0))
         carry = unflatten(like, saved.arrays, str(self.directory))
@@ -188,6 +184,11 @@ class Run:
         kept = [line for line in self.history() if line.get("iteration", 0) <= iteration]
         text = "".join(json.dumps(line) + "\n" for line in kept)
         store.write_text_atomic(self.directory / "log.jsonl", text)
+
+
+def begin(trainer: Trainer, seed: int) -> Carry:
+    """The state of a fresh run."""
+    return _begin(trainer, stream(seed, "train"))
 
 
 @eqx.filter_jit
