@@ -7,19 +7,19 @@ import time
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from rich.console import Console
 from rich.table import Table
 
 from marlyap import config, film, store
 from marlyap.algorithm import AbstractAlgorithm
-from marlyap.algorithms import ALGORITHMS, PRESETS
+from marlyap.algorithms import ALGORITHMS, MASAC, PRESETS
 from marlyap.controllers import CONTROLLERS
 from marlyap.errors import UserError
 from marlyap.evaluate import Evaluation, compare, evaluate, pooled
 from marlyap.game import AbstractGame
-from marlyap.report import html
+from marlyap.report import Film, Page, html
 from marlyap.run import Run, expand
 from marlyap.tasks import TASKS
 from marlyap.train import SCHEDULES, Trainer
@@ -222,10 +222,9 @@ def tabulate(
     console = Console()
     console.print(table)
     for pair in pairs:
-        console.print(
-            f"{pair['a']} against {pair['b']}: only the first {pair['only_a']}, only the second {pair['only_b']}, McNemar p = {pair['p_value']:.2g}",
-            highlight=False,
-        )
+        text = f"{pair['a']} against {pair['b']}: only the first {pair['only_a']}, "
+        text += f"only the second {pair['only_b']}, McNemar p = {pair['p_value']:.2g}"
+        console.print(text, highlight=False)
 
 
 def report(args: Namespace, overrides: Overrides) -> Result:
@@ -234,7 +233,7 @@ def report(args: Namespace, overrides: Overrides) -> Result:
     runs = [Run.open(d, game, algorithm) for d in expand(args.runs)]
     out = args.out or runs[0].directory / "report.html"
     page = film.page(runs, args.episodes, args.seed, command=shlex.join(["marlyap", *sys.argv[1:]]))
-    store.write_text_atomic(out, html(page))
+    store.write_text_atomic(out, html(cast(Page, page)))
     from marlyap import draw
 
     pictures = [out.with_name(f"{out.stem}-{name}") for name in ("starts.png", "learning.png")]
@@ -256,8 +255,10 @@ def watch(args: Namespace, overrides: Overrides) -> Result:
     from marlyap import draw
 
     gif, page = place / "film.gif", place / "film.html"
-    draw.film_gif(shot, gif)
-    store.write_text_atomic(page, html({"title": f"One episode of {run.title}", "films": [shot]}))
+    draw.film_gif(cast(Film, shot), gif)
+    store.write_text_atomic(
+        page, html(cast(Page, {"title": f"One episode of {run.title}", "films": [shot]}))
+    )
     say(f"Film: {page.resolve()} and {gif.resolve()}")
     return {"gif": str(gif), "html": str(page), "success": bool(shot["success"])}, 0
 
@@ -294,13 +295,10 @@ def summary(thing: Any) -> str:
     if isinstance(thing, AbstractGame):
         n, who = thing.agents, len(thing.leaders)
         limits = " and ".join(f"{u:g}" for u in thing.dynamics.limits)
-        line += f" [{n} agents, {who} leader{'s' * (who > 1)}, {thing.graph} graph, limits {limits}]".replace(
-            "[", "("
-        ).replace("]", ")")
-    elif isinstance(thing, AbstractAlgorithm):
-        line += (
-            f" Constraint: {config.show(thing.constraint)}." if hasattr(thing, "constraint") else ""
-        )
+        several = "s" * (who > 1)
+        line += f" ({n} agents, {who} leader{several}, {thing.graph} graph, limits {limits})"
+    elif isinstance(thing, MASAC):
+        line += f" Constraint: {config.show(thing.constraint)}."
     return line
 
 
@@ -309,7 +307,8 @@ def fields_of(name: str) -> dict[str, Any]:
     family = AbstractGame if name in TASKS else AbstractAlgorithm
     if name not in TASKS and name not in ALGORITHMS:
         raise UserError(
-            f"name: there is no task or algorithm '{name}'; {config.suggest(name, [*TASKS, *ALGORITHMS])}"
+            f"name: there is no task or algorithm '{name}'; "
+            f"{config.suggest(name, [*TASKS, *ALGORITHMS])}"
         )
     rows = config.describe(config.load(name, family), config.WORDS[family])
     table = Table(title=name, title_justify="left")
@@ -344,7 +343,7 @@ def demo(args: Namespace, overrides: Overrides) -> Result:
         missing = [d for d in names if d not in there]
         if missing:
             raise UserError(
-                f"seeds: {missing[0]} is not there beside {there[0]}; add --again to train all anew."
+                f"seeds: {missing[0]} is not there beside {there[0]}; train all anew by --again."
             )
         runs = [Run.open(d) for d in names]
         say(f"{args.out} holds these runs; going on with them. To train anew: demo --again")
@@ -358,12 +357,11 @@ def demo(args: Namespace, overrides: Overrides) -> Result:
         Namespace(runs=names, out=out, episodes=500, seed=0, task=None, algorithm=None), {}
     )
     assert result is not None
-    low, high = result["interval"]
-    text = f"{result['successes']} of {result['episodes']} fresh starts succeeded: {100 * result['success_rate']:.1f} %"
-    print(
-        f"{text} (95 % interval {100 * low:.1f} to {100 * high:.1f} %), in {time.monotonic() - start:.0f} s.",
-        file=sys.stderr if args.json else sys.stdout,
-    )
+    low, high = (100 * end for end in result["interval"])
+    rate, seconds = 100 * result["success_rate"], time.monotonic() - start
+    text = f"{result['successes']} of {result['episodes']} fresh starts succeeded: {rate:.1f} % "
+    text += f"(95 % interval {low:.1f} to {high:.1f} %), in {seconds:.0f} s."
+    print(text, file=sys.stderr if args.json else sys.stdout)
     return result | {"seconds": time.monotonic() - start}, 0
 
 

@@ -1,4 +1,4 @@
-"""What a report shows: films, curves and numbers, as plain values."""
+"""What a report shows: films, curves and numbers, as the plain values of `report.Page`."""
 
 import time
 from collections.abc import Sequence
@@ -9,9 +9,9 @@ import jax
 import numpy as np
 
 from marlyap import config
+from marlyap.errors import UserError
 from marlyap.evaluate import Evaluation, episode, evaluate, pooled
 from marlyap.game import AbstractGame
-from marlyap.report import Film, Page
 from marlyap.rollout import Controller
 from marlyap.run import Run, versions
 from marlyap.seeds import stream
@@ -24,16 +24,17 @@ CERTIFIED = (
 )
 
 
-def page(runs: Sequence[Run], episodes: int, seed: int, command: str = "") -> Page:
+def page(runs: Sequence[Run], episodes: int, seed: int, command: str = "") -> dict[str, Any]:
     """Everything that `report.html` draws of these runs."""
     results = [evaluate(run.game, run.controller(), episodes, seed) for run in runs]
     whole = pooled(results).summary()
     names = sorted({run.names["algorithm"] for run in runs})
     tasks = sorted({run.names["task"] for run in runs})
+    game = runs[0].game
     count = f"{len(runs)} training seed{'s' * (len(runs) > 1)}"
     return {
         "title": f"{' and '.join(tasks)}: {' and '.join(names)}",
-        "subtitle": f"{runs[0].game.agents} robots, {len(runs[0].game.leaders)} of them told the target; {count}",
+        "subtitle": f"{game.agents} robots, {len(game.leaders)} of them told the target; {count}",
         "generated": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
         "summary": {
             "success_rate": whole["success_rate"],
@@ -72,21 +73,19 @@ def _row(run: Run, result: Evaluation) -> dict[str, Any]:
     }
 
 
-def films(run: Run, result: Evaluation, seed: int) -> list[Film]:
+def films(run: Run, result: Evaluation, seed: int) -> list[dict[str, Any]]:
     """The best, the median and the worst of the evaluation's episodes, by final distance."""
     order = np.argsort(np.where(np.isfinite(result.final), result.final, np.inf))
     picks = {"best": order[0], "median": order[len(order) // 2], "worst": order[-1]}
     return [one(run, int(k), seed, label, len(order)) for label, k in picks.items()]
 
 
-def one(run: Run, index: int, seed: int, label: str = "", episodes: int = 500) -> Film:
+def one(run: Run, index: int, seed: int, label: str = "", episodes: int = 500) -> dict[str, Any]:
     """One evaluation episode as a film, with L along it where there is one.
 
     Raises UserError if the episode is not among the evaluation's.
     """
     if not 0 <= index < episodes:
-        from marlyap.errors import UserError
-
         raise UserError(
             f"episode: {index} is out of range; the evaluation has 0 to {episodes - 1}."
         )
@@ -114,7 +113,7 @@ def _lyapunov(game: AbstractGame, controller: Controller, L: Any, path: Trajecto
     return jax.vmap(value)(path.state)
 
 
-def strip(game: AbstractGame, path: Trajectory, lyapunov: jax.Array | None) -> Film:
+def strip(game: AbstractGame, path: Trajectory, lyapunov: jax.Array | None) -> dict[str, Any]:
     """A trajectory as the plain values that are drawn."""
     dynamics, state = game.dynamics, path.state
     headings = np.asarray(state.x[:, :, 2]).tolist() if "psi" in dynamics.names else None

@@ -1,4 +1,4 @@
-"""The host loop over compiled iterations: progress, log, checkpoints, and stopping in good order."""
+"""The host loop over compiled iterations: progress, log, checkpoints, stopping in good order."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -18,7 +18,7 @@ from marlyap.game import AbstractGame
 from marlyap.nets import LyapunovNet, NormNet
 from marlyap.rollout import Decentralised, Policy
 from marlyap.run import Run, begin
-from marlyap.train import Carry, Schedule, Trainer
+from marlyap.train import SCHEDULES, Carry, Schedule, Trainer
 
 
 SHARE = 0.02  # of the training time that checkpoints may take
@@ -48,11 +48,11 @@ def _fit(runs: list[Run], stop: Callable[[], bool]) -> Iterator[dict[str, Any]]:
     for run, (carry, _, warnings) in zip(runs, loaded, strict=True):
         run.rewind(int(carry.iteration))
         yield from ({"seed": run.seed, "warning": w} for w in warnings)
-    carry = _stack([carry for carry, _, _ in loaded])
+    first = carry = _stack([carry for carry, _, _ in loaded])
     before, clock = max(s for _, s, _ in loaded), time.monotonic()
     saved, alive = _Saved(clock), [True] * len(runs)
 
-    for done, carry, rows in advance(trainer, carry, stop):
+    for done, carry, rows in advance(trainer, first, stop):
         seconds = before + time.monotonic() - clock
         for i, run in enumerate(runs):
             line = _line(trainer, run.seed, done, seconds, rows, i)
@@ -106,7 +106,7 @@ class Trained:
 def train(
     game: AbstractGame,
     algorithm: AbstractAlgorithm,
-    schedule: Schedule = Schedule(),
+    schedule: Schedule = SCHEDULES["tuned"],
     seed: int = 0,
     on_iteration: Callable[[dict[str, Any]], None] | None = None,
 ) -> Trained:
@@ -116,8 +116,8 @@ def train(
     stops being finite.
     """
     trainer, history, clock = Trainer(game, algorithm, schedule), [], time.monotonic()
-    carry = _stack([begin(trainer, seed)])
-    for done, carry, rows in advance(trainer, carry):
+    first = carry = _stack([begin(trainer, seed)])
+    for done, carry, rows in advance(trainer, first):  # noqa: B007
         line = _line(trainer, seed, done, time.monotonic() - clock, rows, 0)
         if fault := _fault(line):
             raise Diverged(_advice(fault, line) + ".")

@@ -165,7 +165,7 @@ class Critic(eqx.Module):
 
 
 class LyapunovNet(eqx.Module):
-    """L_psi(s, a) >= 0: hidden layers 64, 64 and 16 (section 4); the squares of the last sum to L."""
+    """L_psi(s, a) >= 0: layers of 64, 64 and 16 (section 4); the squares of the last sum to L."""
 
     net: MLP
 

@@ -21,7 +21,7 @@ from marlyap.run import Run
 
 
 class Stop:
-    """Remembers the first signal, so that the loop can end in good order; the second ends at once."""
+    """Remembers the first signal, so that the loop ends in good order; the second ends at once."""
 
     def __init__(self):
         self.signal = 0

@@ -122,7 +122,7 @@ class MASAC(AbstractAlgorithm):
 
         # phi <- phi - iota_pi grad J_pi, eq. (11): first to the actions, then through the actors
         J_pi = lambda now, nxt, b: self.J_pi(now, nxt, l, b)
-        E_J_pi = jax.value_and_grad(lambda drawn: jnp.mean(jax.vmap(J_pi)(*drawn, b)))
+        E_J_pi = jax.value_and_grad(lambda drawn: jnp.mean(jax.vmap(J_pi)(drawn[0], drawn[1], b)))
         loss_pi, to_actions = E_J_pi((now, nxt))
         (gradient,) = chain_rule(to_actions)
         pi = l.pi.step(gradient, decay * self.rate_pi)

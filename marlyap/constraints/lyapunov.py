@@ -167,7 +167,7 @@ class Lyapunov(AbstractConstraint):
         """l_L l_f, the change of L per unit of action."""
         if self.slope == "empirical":
             return L.gradient * self.input_gain
-        if self.slope == "spectral":
+        if self.slope == "spectral" and isinstance(L.net.value, NormNet):
             return L.net.value.lipschitz() * self.input_gain
         return jnp.asarray(self.slope)
 
