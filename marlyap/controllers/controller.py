@@ -1,0 +1,64 @@
+"""What the hand-written controllers share: their seam, and what one agent may know."""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from marlyap.dynamics import Unicycle
+from marlyap.errors import UserError
+from marlyap.game import AbstractGame
+from marlyap.types import Action, Key, State
+
+
+class AbstractController(eqx.Module):
+    """A control law for a team of unicycles; its fields are its gains.
+
+    Row i of the action depends on agent i, on its neighbours in this state and, for a leader, on
+    its goal. A controller keeps no memory, and is a pytree, so that jit compiles it once.
+    """
+
+    game: eqx.AbstractVar[AbstractGame]
+
+    def __check_init__(self):
+        if not isinstance(self.game.dynamics, Unicycle):
+            raise UserError(
+                f"controller: {type(self).__name__} drives unicycles only, not "
+                f"{type(self.game.dynamics).__name__}; choose the dynamics unicycle."
+            )
+
+    @abc.abstractmethod
+    def __call__(self, state: State, key: Key) -> Action:
+        """The inputs of all agents, each divided by its limit, in [-1, 1]."""
+
+
+def headings(game: AbstractGame, state: State) -> Float[Array, "agent 2"]:
+    """h_i, the unit vector along each agent's forward axis."""
+    return jax.vmap(game.dynamics.heading)(state.x)
+
+
+def left(h: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
+    """The vector n a quarter turn to the left of h."""
+    return jnp.stack([-h[..., 1], h[..., 0]], axis=-1)
+
+
+def mean_pull(
+    game: AbstractGame, state: State, q: Float[Array, "agent 2"], leader_gain: float
+) -> Float[Array, "agent 2"]:
+    """e_i = (sum_j (q_j - q_i) + b_i (p*_i - q_i)) / (sum_j 1 + b_i), j over the neighbours (m).
+
+    b_i is `leader_gain` for a leader and 0 for a follower; e_i is 0 where nothing pulls.
+    """
+    linked = game.linked(state)
+    b = jnp.where(jnp.asarray(game.leads), leader_gain, 0.0)
+    gaps = jnp.where(linked[:, :, None], q[None, :] - q[:, None], 0.0)
+    weight = jnp.sum(linked, axis=1) + b
+    pull = jnp.sum(gaps, axis=1) + b[:, None] * (state.goal - q)
+    return pull / jnp.where(weight > 0, weight, 1.0)[:, None]
+
+
+def as_action(game: AbstractGame, u: Float[Array, "agent du"]) -> Action:
+    """Physical inputs (m/s^2, rad/s^2) as an action: divided by their limits and clipped."""
+    return jnp.clip(u / jnp.asarray(game.dynamics.limits)[None], -1.0, 1.0)

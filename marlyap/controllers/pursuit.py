@@ -1,0 +1,47 @@
+"""Tree pursuit: every agent drives to where the next agent towards a leader will stop (B5)."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from marlyap import graph as graphs
+from marlyap.controllers.cascade import Cascade
+from marlyap.controllers.controller import AbstractController, as_action, headings
+from marlyap.game import AbstractGame
+from marlyap.types import State
+
+
+class TreePursuit(AbstractController):
+    """A leader drives to its goal, a follower to the predicted stop point of its parent.
+
+    The parent of i is the neighbour with the fewest hops to a leader (the lowest index among
+    equals), so errors travel down a tree only. It will stop about `margin` v_j^2 / (2 a_max) ahead
+    on its heading. An agent needs its neighbours' hop counts, one local message, and its parent's
+    velocity. An agent that no path joins to a leader brakes.
+    """
+
+    game: AbstractGame
+    margin: float = 1.9  # predicted stopping distance over the shortest possible
+    cascade: Cascade = Cascade()
+
+    def __call__(self, state, key):
+        leads, parent = jnp.asarray(self.game.leads), self.parents(state)
+        p, v = self.game.positions(state), state.x[:, 3]
+        stop = self.margin * v * jnp.abs(v) / (2 * self.game.dynamics.limits[0])
+        ends = p + stop[:, None] * headings(self.game, state)
+        follow = jnp.where((parent >= 0)[:, None], ends[parent], p)
+        e = jnp.where(leads[:, None], state.goal, follow) - p
+        u = jax.vmap(self.cascade, in_axes=(None, 0, 0))(self.game, state.x, e)
+        return as_action(self.game, u)
+
+    def parents(self, state: State) -> Int[Array, "agent"]:
+        """The parent of each agent, -1 where there is no path to a leader."""
+        linked, n = self.game.linked(state), self.game.agents
+        if graphs.disk_radius(self.game.graph) is None:
+            hops = jnp.asarray(graphs.hops(self.game.adjacency, self.game.leaders))
+        else:
+            start = jnp.where(jnp.asarray(self.game.leads), 0, n)
+            relax = lambda _, h: jnp.minimum(h, 1 + jnp.min(jnp.where(linked, h[None], n), axis=1))
+            hops = jax.lax.fori_loop(0, n - 1, relax, start)
+        seen = jnp.where(linked, hops[None], n)
+        return jnp.where(jnp.min(seen, axis=1) < n, jnp.argmin(seen, axis=1), -1)
