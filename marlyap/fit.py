@@ -75,8 +75,8 @@ def advance(
 ) -> Iterator[tuple[int, Carry, dict[str, np.ndarray]]]:
     """Iterate to the end or until `stop()`; yields (iterations done, carry, what the log wants).
 
-    Every array of `carry` has a leading axis of runs, and so have the arrays of the log. The carry
-    that goes in is used up.
+    The arrays of `carry` have a leading axis of runs where there are several; those of the log
+    always have it. The carry that goes in is used up.
     """
     done = int(np.min(carry.iteration))
     while done < trainer.iterations and not stop():
@@ -85,7 +85,7 @@ def advance(
         if done % trainer.schedule.judge_every == 0 or done == trainer.iterations:
             carry, look = _judge(trainer, carry)
             info |= look
-        yield done, carry, jax.tree.map(np.asarray, info)
+        yield done, carry, jax.tree.map(np.atleast_1d, info)
 
 
 @dataclass(frozen=True)
@@ -147,20 +147,20 @@ class _Saved:
 
 
 def _stack(carries: list[Carry]) -> Carry:
-    """One leading axis for the runs."""
+    """A leading axis for several runs; one alone stays as it is, or XLA would copy its memory."""
     join = lambda *xs: jnp.stack(xs) if eqx.is_array(xs[0]) else xs[0]
-    return jax.tree.map(join, *carries)
+    return jax.tree.map(join, *carries) if len(carries) > 1 else carries[0]
 
 
 def _row(carry: Carry, i: int) -> Carry:
+    if carry.iteration.ndim == 0:
+        return carry
     return jax.tree.map(lambda x: x[i] if eqx.is_array(x) else x, carry)
 
 
 def _each(f: Callable[[Carry], Any], carry: Carry) -> Any:
     """`f` for every run: vmapped only when there are several, since a batch of one costs speed."""
-    if carry.iteration.shape[0] > 1:
-        return eqx.filter_vmap(f)(carry)
-    return jax.tree.map(lambda x: x[None] if eqx.is_array(x) else x, f(_row(carry, 0)))
+    return f(carry) if carry.iteration.ndim == 0 else eqx.filter_vmap(f)(carry)
 
 
 @eqx.filter_jit(donate="all-except-first")

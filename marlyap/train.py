@@ -98,7 +98,8 @@ class Trainer(eqx.Module):
         learner = self.algorithm.init(shape(self.game), k_init)
         episodes = max(1, -(-s.warmup // self.game.horizon))
         warm = self.play(random, k_warm, episodes)
-        rows = max(s.capacity // self.game.horizon, episodes, s.environments)
+        needed = episodes + self.iterations * s.environments
+        rows = min(needed, max(s.capacity // self.game.horizon, episodes, s.environments))
         memory = Replay.empty(jax.tree.map(lambda x: x[0], warm), rows).add(warm)
         best = self.algorithm.exploit(learner)
         return Carry(learner, memory, key, jnp.asarray(0), best, jnp.zeros(()))
