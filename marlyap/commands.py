@@ -28,7 +28,7 @@ from marlyap.workers import train_all
 
 Result = tuple[dict[str, Any] | None, int]
 Overrides = dict[str, str]
-DEMO_STEPS = 204_800
+DEMO_STEPS = 163_840
 
 
 def train(args: Namespace, overrides: Overrides) -> Result:

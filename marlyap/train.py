@@ -26,7 +26,7 @@ from marlyap.types import Key, Scalar
 class Schedule(eqx.Module):
     """How much is played and learnt. An iteration plays `environments` episodes, then updates."""
 
-    steps: int = 614_400  # environment steps in all
+    steps: int = 204_800  # environment steps in all
     environments: int = 64  # episodes played side by side in an iteration
     steps_per_update: int = 8  # environment steps for one gradient step
     warmup: int = 2_560  # environment steps of uniformly random actions before learning

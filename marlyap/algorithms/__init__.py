@@ -10,10 +10,21 @@ from marlyap.algorithms.masac import MASAC as MASAC
 from marlyap.constraints import Lyapunov
 
 
-def paper(algorithm: MASAC) -> MASAC:
-    """The networks and learning rates of section 4: no LayerNorm, one value for the team."""
-    plain = dict(normalise=False, heads="team", average=1.0, reward_scale=1.0, rate_Q=3e-3)
-    return dataclasses.replace(algorithm, **plain)
+def paper(algorithm: AbstractAlgorithm) -> AbstractAlgorithm:
+    """Section 4: plain networks, one value for the team, the weight of Delta L learnt."""
+    if not isinstance(algorithm, MASAC):
+        return algorithm
+    constraint = algorithm.constraint
+    if isinstance(constraint, Lyapunov):
+        constraint = dataclasses.replace(constraint, weight=None)
+    return dataclasses.replace(
+        algorithm,
+        normalise=False,
+        heads="team",
+        average=1.0,
+        reward_scale=1.0,
+        constraint=constraint,
+    )
 
 
 PRESETS = {"tuned": lambda algorithm: algorithm, "paper": paper}
