@@ -57,11 +57,11 @@ def optimal(game, episodes):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="200 episodes, printed, not stored")
+    parser.add_argument("--quick", action="store_true", help="two settings, 200 episodes, printed")
     quick = parser.parse_args().quick
     table = csv.writer(sys.stdout if quick else RESULTS.open("w", newline=""), lineterminator="\n")
     table.writerow([*COLUMNS.split(), "seed"])
-    for n, graph, leaders, limit, horizon in SETTINGS:
+    for n, graph, leaders, limit, horizon in SETTINGS[2::7] if quick else SETTINGS:
         team = {"agents": n, "graph": graph, "leaders": tuple(range(leaders)), "horizon": horizon}
         game, final = Rendezvous(**team, dynamics=Unicycle(limits=(limit, limit))), {}
         for name, gains in VARIANTS.items():
