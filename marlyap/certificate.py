@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
+from marlyap.identity import plain
 from marlyap.lyapunov_function import AbstractLyapunov
 from marlyap.rollout import Controller, rollout
 from marlyap.seeds import Purpose, stream
@@ -55,7 +56,7 @@ class Judgement(eqx.Module):
 
     holds: Bool[Array, ""]
     badness: Scalar  # larger is worse; it picks the worst case
-    figures: dict[str, Scalar]
+    figures: dict[str, Array]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +86,7 @@ Judge = Callable[[AbstractGame, AbstractLyapunov, Trajectory], Judgement]
 
 @eqx.filter_jit
 def _roll(
-    game: AbstractGame, controller: Controller, key: Key, indices: Array, steps: int
+    game: AbstractGame, controller: Controller, key: Key, indices: Any, steps: int
 ) -> Trajectory:
     def one(index: Array) -> Trajectory:
         k_start, k_act = jax.random.split(jax.random.fold_in(key, index))
@@ -126,7 +127,7 @@ def judged(
     size = max(1, min(count, 1000, CHUNK // (game.agents * (long + 1))))
     key, parts = stream(seed, purpose), []
     for first in range(0, count, size):
-        seen = _roll(game, controller, key, jnp.arange(first, first + size), long)
+        seen = _roll(game, controller, key, np.arange(first, first + size), long)
         parts.append(jax.tree.map(np.asarray, _judge(judge, game, V, seen, steps)))
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *map(vars, parts))
     return Found(**joined)
@@ -147,7 +148,12 @@ def finite(tree: PyTree) -> Bool[Array, ""]:
 
 def start_of(game: AbstractGame, seed: int, purpose: Purpose, episode: int) -> State:
     """The start of one rollout: what a verdict's worst case names."""
-    k_start, _ = jax.random.split(jax.random.fold_in(stream(seed, purpose), episode))
+    return _start(game, stream(seed, purpose), np.asarray(episode))
+
+
+@eqx.filter_jit
+def _start(game: AbstractGame, key: Key, episode: Any) -> State:
+    k_start, _ = jax.random.split(jax.random.fold_in(key, episode))
     return game.reset(k_start)
 
 
@@ -200,22 +206,3 @@ def scope(game: AbstractGame, steps: int, disturbance: str = "none") -> dict[str
         "disturbance": disturbance,
         "radius": game.radius,
     }
-
-
-def plain(value: Any) -> Any:
-    """Modules, arrays and numbers as JSON values; what is not finite becomes null."""
-    if isinstance(value, eqx.Module):
-        kind = {"kind": type(value).__name__}
-        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
-        return kind | plain(fields)
-    if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    if isinstance(value, (np.ndarray, jax.Array)):
-        return plain(np.asarray(value).tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if isinstance(value, (str, int, bool, type(None))) else str(value)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,10 @@ import jax
 import numpy as np
 
 from marlyap import store
-from marlyap.certificate import AbstractCertificate, plain
+from marlyap.certificate import AbstractCertificate
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
+from marlyap.identity import named_arrays, plain, policy_hash, without_arrays, words
 from marlyap.lyapunov_function import AbstractLyapunov, CostSum, require_zero
 from marlyap.rollout import Controller
 from marlyap.seeds import stream
@@ -53,7 +53,7 @@ def certify(
             f"policy: its hash is {digest[:12]}, not the declared {policy[:12]}; a certificate is "
             "for a policy that was fixed beforehand."
         )
-    V = CostSum(controller, ball=game.radius / 2) if V is None else V
+    V = CostSum(controller=controller, ball=game.radius / 2) if V is None else V
     require_zero(game, V, stream(seed, "calibrate"))
     sampled = sum(c.evidence == "statistical" for c in certificates.values())
     each = bonferroni(confidence, max(1, sampled) * checkpoints)
@@ -68,8 +68,8 @@ def certify(
         "seed": seed,
         "policy": digest,
         "game": plain(game),
-        "controller": plain(_without_arrays(controller)),
-        "V": plain(_without_arrays(V)),
+        "controller": plain(without_arrays(controller)),
+        "V": plain(without_arrays(V)),
         "certificates": {name: plain(c) for name, c in asked.items()},
         "verdicts": {name: verdict.as_dict() for name, verdict in verdicts.items()},
     }
@@ -90,10 +90,11 @@ def save(
     """
     if policy_hash(controller) != result["policy"]:
         raise UserError("policy: this controller is not the one that was certified.")
-    V = CostSum(controller, ball=game.radius / 2) if V is None else V
+    V = CostSum(controller=controller, ball=game.radius / 2) if V is None else V
     count = max((c.get("rollouts", 0) for c in result["certificates"].values()), default=0)
     arrays = {f"starts/{k}": v for k, v in starts(game, result["seed"], count).items()}
     arrays |= {f"controller/{k}": v for k, v in named_arrays(controller).items()}
+    arrays["controller/words"] = words(controller)
     arrays |= {f"V/{k}": v for k, v in named_arrays(V).items()}
     arrays |= {"graph/slots": game.slots, "graph/linked": game.adjacency, "graph/leads": game.leads}
     arrays = {k: np.asarray(v) for k, v in arrays.items()}
@@ -108,7 +109,7 @@ def starts_hash(arrays: Mapping[str, np.ndarray]) -> str:
 
 
 @eqx.filter_jit
-def _starts(game: AbstractGame, key: jax.Array, indices: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _starts(game: AbstractGame, key: jax.Array, indices: Any) -> tuple[jax.Array, jax.Array]:
     def one(index):
         k_start, _ = jax.random.split(jax.random.fold_in(key, index))
         state = game.reset(k_start)
@@ -121,28 +122,3 @@ def starts(game: AbstractGame, seed: int, count: int) -> dict[str, np.ndarray]:
     """The starts that the sampled certificates judge, in their order."""
     x, goal = _starts(game, stream(seed, "certify"), np.arange(max(count, 1)))
     return {"x": np.asarray(x), "goal": np.asarray(goal)}
-
-
-def policy_hash(controller: Controller) -> str:
-    """SHA-256 of every number and word the controller is made of."""
-    numbers = named_arrays(controller)
-    leaves = jax.tree_util.tree_flatten_with_path(controller)[0]
-    words = {"kind": type(controller).__name__} | {
-        _name(path): leaf for path, leaf in leaves if isinstance(leaf, (str, int, float, bool))
-    }
-    text = json.dumps(words, sort_keys=True).encode()
-    return store.hash_arrays(numbers | {"words": np.frombuffer(text, np.uint8)})
-
-
-def named_arrays(tree: Any) -> dict[str, np.ndarray]:
-    """The arrays of a module by their path, such as policy.pi.net.layers.0.weight."""
-    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
-    return {_name(path): np.asarray(leaf) for path, leaf in leaves if eqx.is_array(leaf)}
-
-
-def _name(path: Any) -> str:
-    return ".".join(str(getattr(p, "name", getattr(p, "idx", getattr(p, "key", p)))) for p in path)
-
-
-def _without_arrays(tree: Any) -> Any:
-    return eqx.filter(tree, eqx.is_array, inverse=True)

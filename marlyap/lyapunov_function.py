@@ -21,7 +21,11 @@ class AbstractLyapunov(eqx.Module):
     """V(s) >= 0. It has to fall by a share of c_rho(s), the mean of max(0, distance_i - rho)."""
 
     ball: eqx.AbstractVar[float]  # rho (m)
-    beyond: eqx.AbstractVar[int]  # how many steps past a state `along` has to see
+
+    @property
+    @abc.abstractmethod
+    def beyond(self) -> int:
+        """How many steps past a state `along` has to see."""
 
     @abc.abstractmethod
     def value(self, game: AbstractGame, state: State) -> Scalar:
@@ -49,7 +53,7 @@ class CostSum(AbstractLyapunov):
     ball: float = 0.0  # rho (m)
 
     @property
-    def beyond(self) -> int:
+    def beyond(self):
         return self.T
 
     def value(self, game, state):
@@ -67,7 +71,10 @@ class Quadratic(AbstractLyapunov):
 
     P: Float[Array, "error error"]
     ball: float = 0.0
-    beyond: int = 0
+
+    @property
+    def beyond(self):
+        return 0
 
     def value(self, game, state):
         e = game.errors(state)
@@ -82,7 +89,10 @@ class Norm(AbstractLyapunov):
 
     net: NormNet
     ball: float = 0.0
-    beyond: int = 0
+
+    @property
+    def beyond(self):
+        return 0
 
     def value(self, game, state):
         return self.net(game.features(state))
@@ -100,7 +110,10 @@ class ActionValue(AbstractLyapunov):
     net: LyapunovNet
     controller: Controller
     ball: float = 0.0
-    beyond: int = 0
+
+    @property
+    def beyond(self):
+        return 0
 
     def value(self, game, state):
         return self.net(game.features(state), self.controller(state, jax.random.key(0)))

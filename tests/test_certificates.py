@@ -1,5 +1,6 @@
 """Certificates on games whose answer is known: they accept the stable and refuse the rest."""
 
+import dataclasses
 import json
 
 import equinox as eqx
@@ -9,17 +10,28 @@ import numpy as np
 import pytest
 
 from marlyap.certificate import AbstractCertificate, start_of
-from marlyap.certificates import CERTIFICATES
+from marlyap.certificates import CERTIFICATES, bounds
 from marlyap.certificates.basin import Basin, largest_level
+from marlyap.certificates.closed_form import ClosedForm
+from marlyap.certificates.composition import Composition, fit_row
 from marlyap.certificates.contraction import Contraction, failures_allowed
 from marlyap.certificates.decrease import Decrease
+from marlyap.certificates.linearisation import Linearisation
+from marlyap.certificates.proof import Loop, Proof, lyapunov
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
-from marlyap.certify import certify, policy_hash, save
-from marlyap.dynamics import AbstractDynamics, SingleIntegrator
+from marlyap.certificates.robustness import Robustness
+from marlyap.certificates.theorem1 import Theorem1, input_jacobian, l_f
+from marlyap.certify import certify, save
+from marlyap.controllers.point_offset import PointOffset
+from marlyap.dynamics import AbstractDynamics, DoubleIntegrator, SingleIntegrator, Unicycle
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
-from marlyap.lyapunov_function import CostSum, Quadratic
+from marlyap.identity import policy_hash
+from marlyap.lyapunov_function import CostSum, Norm, Quadratic
+from marlyap.nets import Actors, Greedy, NormNet, Shape
+from marlyap.perturb import Perturbed
+from marlyap.rollout import Decentralised
 from marlyap.statistics import lower_bound
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State
@@ -235,3 +247,166 @@ def test_the_cost_sum_changes_by_the_identity():
     change = V.value(game, states[1]) - V.value(game, states[0])
     cost = lambda s: V.cost(game, s)
     assert float(change) == pytest.approx(float(cost(states[7]) - cost(states[0])), abs=1e-6)
+
+
+def test_a_perturbation_changes_what_it_says():
+    game = Rendezvous(agents=3, graph="path")
+    plain, key = game.reset(jax.random.key(0)), jax.random.key(0)
+    action = jnp.full((3, 2), 0.4)
+    step = lambda **change: Perturbed(game, **change).step(
+        Perturbed(game, **change).reset(key), action
+    )
+    nominal = game.step(plain, action)
+    assert np.array_equal(step().x, nominal.x)
+    assert np.allclose(step(gain=2.0).x[:, 3:], 2 * nominal.x[:, 3:])
+    assert np.array_equal(step(delay=1).x, plain.x)
+    assert not np.allclose(step(noise=0.1).x, nominal.x)
+    far = Perturbed(game, spread=2.0).reset(key)
+    assert np.allclose(far.x[:, :2], 2 * plain.x[:, :2])
+    obs, at = game.observe(plain), Perturbed(game, cut=((1, 2),))
+    assert np.array_equal(at.observe(plain)[0], obs[0])
+    assert not np.asarray(at.observe(plain)[2])[-7:].any() and np.asarray(obs[2]).any()
+    lost = Perturbed(game, gone=(2,))
+    assert float(lost.distance(plain)[2]) == 0.0
+    assert not np.asarray(lost.linked(plain))[2].any()
+    silent = Perturbed(game, drop=1.0)
+    assert not np.asarray(silent.linked(silent.reset(key))).any()
+
+
+def test_robustness_finds_what_breaks():
+    table = {"robustness": Robustness(400, (0.5, 1.0), (), (0,), spreads=(1.0,), share=0.9)}
+    verdict = certified(POINT, Scripted(), table)["verdicts"]["robustness"]
+    assert verdict["holds"] and len(verdict["figures"]["curve"]) == 4
+    table = {"robustness": Robustness(400, (0.01,), (), (), spreads=(), share=0.9)}
+    verdict = certified(POINT, Scripted(), table)["verdicts"]["robustness"]
+    assert not verdict["holds"] and verdict["worst"]["change"] == {"gain": 0.01}
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.3, 5.0])
+def test_l_f_is_exact(speed):
+    """The formula of the unicycle against automatic differentiation."""
+    model, dt = Unicycle(), 0.1
+    x = jnp.array([0.3, -0.2, 0.7, speed, 0.4])
+    assert l_f(model, dt, speed) == pytest.approx(
+        float(np.linalg.norm(input_jacobian(model, x, dt), 2)), rel=1e-5
+    )
+
+
+@pytest.mark.parametrize("A, fine", [(0.8, True), (1.0, False), (1.02, False)])
+def test_theorem1(A, fine):
+    table = {"theorem1": Theorem1(rollouts=N, share=0.95, rate=0.05)}
+    verdict = certified(flow([[A, 0.0], [0.0, A]]), Idle(), table, V=Quadratic(jnp.eye(2)))
+    verdict = verdict["verdicts"]["theorem1"]
+    assert verdict["holds"] == fine and verdict["worst"]["failed"] != fine
+
+
+def test_theorem1_charges_for_the_change_of_policy():
+    table = {"theorem1": Theorem1(noise=1.0, rollouts=N, share=0.95)}
+    verdict = certified(POINT, Scripted(), table, V=Quadratic(jnp.eye(2)))["verdicts"]["theorem1"]
+    assert not verdict["holds"] and verdict["figures"]["margin_worst"] < 0
+
+
+@pytest.mark.parametrize("A, fine", [(0.8, True), (1.0, False), (1.02, False)])
+def test_composition(A, fine):
+    table = {"composition": Composition(rollouts=N, calibration=N, share=0.9)}
+    result = certified(flow([[A, 0.0], [0.0, A]]), Idle(), table)
+    assert result["holds"] == fine
+
+
+def test_composition_fits_a_known_row():
+    """V_0+ = 0.5 V_0 + 0.25 V_1 exactly."""
+    game = Rendezvous(agents=2, dynamics=SingleIntegrator())
+    values = np.abs(np.random.default_rng(0).normal(size=(50, 2, 2)))
+    values[:, 1, 0] = 0.5 * values[:, 0, 0] + 0.25 * values[:, 0, 1]
+    row, delta = fit_row(game, values, 1, 0, 1e-3)
+    assert np.allclose(row, [0.5, 0.25], atol=1e-5) and delta < 1e-6
+
+
+def test_closed_form_of_a_path_of_two():
+    game = Rendezvous(agents=2, graph="path")
+    law = PointOffset(game, offset=0.1, leader_gain=1.0, k_p=4.0, k_d=4.0)
+    verdict = ClosedForm().check(game, law, CostSum(law), 0)
+    assert np.allclose(verdict.figures["eigenvalues"], 1 - np.array([1, -1]) / 2**0.5)
+    roots = np.roots([1.0, 4.0, 4.0 * (1 - 1 / 2**0.5)])
+    assert verdict.holds and verdict.bound == pytest.approx(-max(roots.real))
+    for P, mu in zip(verdict.figures["P"], verdict.figures["eigenvalues"], strict=True):
+        A = np.array([[0.0, 1.0], [-4.0 * mu, -4.0]])
+        assert np.allclose(A.T @ P + np.array(P) @ A, -np.eye(2))
+    unstable = PointOffset(game, k_p=4.0, k_d=-1.0)
+    assert not ClosedForm().check(game, unstable, CostSum(law), 0).holds
+    with pytest.raises(UserError, match="PointOffset"):
+        ClosedForm().check(game, Idle(), CostSum(law), 0)
+
+
+def test_the_linearisation_says_no_to_the_unicycle():
+    game = Rendezvous(agents=1)
+    verdict = Linearisation().check(game, Idle(), CostSum(Idle()), 0)
+    assert not verdict.holds and verdict.figures["controllability_rank"] == 4
+    assert verdict.claim.startswith("transverse-exponential: NO")
+    assert verdict.figures["uncontrollable_eigenvalues"] == [1.0]
+    assert Linearisation().check(POINT, Scripted(), CostSum(Idle()), 0).holds
+    assert not Linearisation().check(POINT, Idle(), CostSum(Idle()), 0).holds
+
+
+def policy_of(K, hidden=16):
+    """A network of one agent that computes tanh(K (e, rates)) exactly."""
+    game = Rendezvous(agents=1, dynamics=DoubleIntegrator())
+    actors = Actors(Shape(1, 7, 6, 4, 2), hidden, key=jax.random.key(0))
+    W = [np.zeros(l.weight.shape, np.float32) for l in actors.net.layers]
+    for i, column in enumerate((3, 4, 0, 1)):  # e, then rates, in what the agent sees
+        for row, sign in ((2 * i, 1.0), (2 * i + 1, -1.0)):
+            W[0][0, row, column], W[1][0, row, row] = sign, 1.0
+            W[2][0, :2, row] = sign * np.asarray(K)[:, i]
+    leaves = lambda a: [l.weight for l in a.net.layers] + [l.bias for l in a.net.layers]
+    zeros = [jnp.zeros_like(l.bias) for l in actors.net.layers]
+    actors = eqx.tree_at(leaves, actors, [*map(jnp.asarray, W), *zeros])
+    return game, Decentralised(Greedy(actors), game)
+
+
+GAINS = np.array([[0.8, 0, -0.8, 0], [0, 0.8, 0, -0.8]])
+FORM = Quadratic(
+    jnp.array([[11.1, 0, -0.52, 0], [0, 11.1, 0, -0.52], [-0.52, 0, 1.68, 0], [0, -0.52, 0, 1.68]])
+)
+ANNULUS = Proof(c=1.0, rho=0.7, inner=0.7, half=(0.31, 0.31, 0.8, 0.8), eta=1e-4)
+
+
+def test_a_proof_succeeds_resumes_and_refutes(tmp_path):
+    game, stable = policy_of(GAINS)
+    assert ANNULUS.check(game, stable, FORM, 0).figures["answer"] == "proved"
+    place = str(tmp_path / "proof")
+    short = dataclasses.replace(ANNULUS, most=5_000, resume=place)
+    verdict = short.check(game, stable, FORM, 0)
+    assert not verdict.holds and verdict.figures["answer"] == "undecided"
+    assert 0 < verdict.figures["volume_left"] <= 1
+    assert dataclasses.replace(short, most=10**6).check(game, stable, FORM, 0).holds
+    for K in (-GAINS, 0 * GAINS):  # unstable and marginal
+        verdict = ANNULUS.check(*policy_of(K), FORM, 0)
+        assert verdict.figures["answer"] == "refuted" and verdict.worst["V_next"] > 0
+    with pytest.raises(UserError, match="another proof"):
+        short.check(*policy_of(-GAINS), FORM, 0)
+
+
+def test_the_bounds_of_the_unicycle_hold_at_random_points():
+    game = Rendezvous(agents=1)
+    shape = Shape(1, 7, 6, 4, 2)
+    controller = Decentralised(Greedy(Actors(shape, 32, key=jax.random.key(3))), game)
+    V = Norm(NormNet(shape, key=jax.random.key(1)))
+    rng = np.random.default_rng(0)
+    centre, radius = rng.uniform(-1, 1, (500, 4)), rng.uniform(0, 0.2, (500, 4))
+    box = bounds.box(centre, radius)
+    moved, V_of = Loop(game, controller)(box), lyapunov(V)
+    before, after = V_of(box), V_of(moved)
+    change = bounds.add(after, before, -1.0)
+
+    @eqx.filter_jit
+    def truth(x):
+        state = State(
+            x=jnp.array([[0.0, 0.0, 0.0, x[2], x[3]]]), goal=x[None, :2], t=jnp.asarray(0)
+        )
+        later = game.step(state, controller(state, jax.random.key(0)))
+        return game.errors(later)[0], V.value(game, state)[None], V.value(game, later)[None]
+
+    x = centre + radius * rng.uniform(-1, 1, centre.shape)
+    f, V0, V1 = (np.asarray(a, float) for a in jax.vmap(truth)(jnp.asarray(x)))
+    for bound, value in ((moved, f), (before, V0), (after, V1), (change, V1 - V0)):
+        assert (bound.low <= value + 1e-5).all() and (value <= bound.high + 1e-5).all()

@@ -1,11 +1,16 @@
-"""The certificates by name, configured."""
+"""The certificates by name, configured. A proof needs its region, so that there is none here."""
 
 from marlyap.certificate import AbstractCertificate
 from marlyap.certificates.basin import Basin
+from marlyap.certificates.closed_form import ClosedForm
+from marlyap.certificates.composition import Composition
 from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
+from marlyap.certificates.linearisation import Linearisation
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
+from marlyap.certificates.robustness import Robustness
+from marlyap.certificates.theorem1 import Theorem1
 
 
 CERTIFICATES: dict[str, AbstractCertificate] = {
@@ -15,4 +20,9 @@ CERTIFICATES: dict[str, AbstractCertificate] = {
     "contraction": Contraction(),
     "basin": Basin(),
     "quantiles": Quantiles(),
+    "robustness": Robustness(),
+    "theorem1": Theorem1(),
+    "composition": Composition(),
+    "linearisation": Linearisation(),
+    "closed-form": ClosedForm(),  # for the point-offset law only
 }

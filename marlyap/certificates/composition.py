@@ -1,0 +1,156 @@
+"""C7: a team's certificate put together from one function per agent; the route to many agents."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import linprog
+
+from marlyap.certificate import (
+    AbstractCertificate,
+    Evidence,
+    Judgement,
+    Verdict,
+    at_least,
+    enough,
+    judged,
+    scope,
+    worst_of,
+)
+from marlyap.game import AbstractGame
+
+
+class Composition(AbstractCertificate):
+    """C7 (statistical small gain). With V_i the largest distance of agent i to its goal over the
+    next T steps and M = diag(1 - a) + Gamma >= 0, Gamma_ij > 0 for neighbours j of i only:
+
+        V_i(s_{t+T}) <= (1 - a_i) V_i(s_t) + sum_j Gamma_ij V_j(s_t) + delta_i  for all i, t   (*)
+        rho(M) < 1  =>  limsup V <= (I - M)^-1 delta, componentwise (the ultimate bound).
+
+    M and delta come from one linear programme per agent on one set of rollouts, with delta enlarged
+    by `slack`. With the confidence asked for, P[ (*) holds along the whole rollout ] >= bound on
+    fresh rollouts; where (*) holds, the bound on V follows without any chance.
+    """
+
+    rollouts: int = 5_000
+    calibration: int = 3_000
+    T: int = 10  # steps
+    stay: int = 40  # steps past the horizon that are looked at
+    weights: tuple[float, ...] = (0.01, 0.03, 0.1, 0.3, 1.0)  # price of a gain against delta (m)
+    slack: float = 0.2  # relative, on delta
+    within: float | None = None  # the largest ultimate bound that is worth claiming (m); the radius
+    share: float = 0.9
+    confidence: float = 0.999
+    evidence: ClassVar[Evidence] = "statistical"
+
+    def check(self, game, controller, V, seed):
+        enough(self.rollouts, self.share, self.confidence)
+        steps = game.horizon + self.stay + self.T
+        draw = lambda purpose, n: judged(
+            _Windows(self.T), game, controller, V, seed, purpose, n, steps
+        )
+        data = draw("calibrate", self.calibration)
+        M, delta, ultimate = self.fit(game, data.figures["V"][data.holds])
+        rho = float(np.max(np.abs(np.linalg.eigvals(M)))) if np.isfinite(M).all() else np.inf
+        found = draw("certify", self.rollouts)
+        excess = worst_excess(found.figures["V"], M, delta, self.T)
+        found = type(found)(found.holds & (excess <= 0), excess, {"excess": excess})
+        n, k = self.rollouts, int(found.holds.sum())
+        bound, shown = at_least(k, n, self.share, self.confidence)
+        farthest = float(np.max(ultimate))
+        within = game.radius if self.within is None else self.within
+        return Verdict(
+            name="composition",
+            claim=f"along at least a share {bound:.4f} of the rollouts the agents' functions obey "
+            f"inequalities with spectral radius {rho:.3f}, by which all distances would end "
+            f"below {farthest:.3g} m",
+            evidence=self.evidence,
+            holds=bool(shown and rho < 1 and farthest <= within),
+            bound=bound,
+            confidence=self.confidence,
+            scope=scope(game, steps),
+            trials=n,
+            successes=k,
+            worst=worst_of(game, seed, "certify", found),
+            figures={
+                "rho": rho,
+                "M": M.tolist(),
+                "delta": delta.tolist(),
+                "ultimate": ultimate.tolist(),
+                "T": self.T,
+                "share_asked": self.share,
+            },
+        )
+
+    def fit(
+        self, game: AbstractGame, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """M, delta and the ultimate bound, for the weight whose ultimate bound is the least."""
+        N = game.agents
+        best = np.full((N, N), np.inf), np.full(N, np.inf), np.full(N, np.inf)
+        if len(values) == 0:
+            return best
+        for weight in self.weights:
+            rows = [fit_row(game, values, self.T, i, weight) for i in range(N)]
+            M = np.stack([row for row, _ in rows])
+            delta = np.array([(1 + self.slack) * d for _, d in rows]) + 1e-6
+            if np.max(np.abs(np.linalg.eigvals(M))) >= 1 - 1e-6:
+                continue
+            ultimate = np.linalg.solve(np.eye(N) - M, delta)
+            if np.max(ultimate) < np.max(best[2]):
+                best = M, delta, ultimate
+        return best
+
+
+class _Windows(eqx.Module):
+    """V_i of every agent at every time of a rollout."""
+
+    T: int
+
+    def __call__(self, game, V, trajectory) -> Judgement:
+        distance = jax.vmap(game.distance)(trajectory.state)
+        time = distance.shape[0] - self.T + 1
+        window = jnp.arange(time)[:, None] + jnp.arange(self.T)[None, :]
+        values = jnp.max(distance[window], axis=1)
+        return Judgement(jnp.asarray(True), jnp.max(values[-1]), {"V": values})
+
+
+def fit_row(
+    game: AbstractGame, values: np.ndarray, T: int, i: int, weight: float, rounds: int = 30
+) -> tuple[np.ndarray, float]:
+    """min delta + weight sum_j M_ij  so that (*) holds for agent i on all transitions.
+
+    Of the millions of inequalities a handful binds: they are added as they turn out violated.
+    """
+    who = [i, *(int(j) for j in np.flatnonzero(game.adjacency[i]))]
+    now = values[:, :-T][..., who].reshape(-1, len(who))
+    ahead = values[:, T:, i].ravel()
+    pick = np.linspace(0, len(ahead) - 1, min(500, len(ahead))).astype(int)
+    cost = np.append(np.full(len(who), weight), 1.0)
+    bounds = [(0.0, 0.98), *[(0.0, None)] * (len(who) - 1), (0.0, None)]
+    solution = np.zeros(len(who) + 1)
+    for _ in range(rounds):
+        left = -np.column_stack([now[pick], np.ones(len(pick))])
+        solved = linprog(cost, left, -ahead[pick], bounds=bounds, method="highs")
+        solution = solved.x
+        excess = ahead - now @ solution[:-1] - solution[-1]
+        if np.max(excess) <= 1e-7:
+            break
+        pick = np.unique(np.append(pick, np.argsort(excess)[-200:]))
+    delta = float(
+        solution[-1] + max(0.0, float(np.max(ahead - now @ solution[:-1] - solution[-1])))
+    )
+    row = np.zeros(game.agents)
+    row[who] = solution[:-1]
+    return row, delta
+
+
+def worst_excess(values: np.ndarray, M: np.ndarray, delta: np.ndarray, T: int) -> np.ndarray:
+    """The largest violation of (*) along each rollout; infinite if there is no M."""
+    if not np.isfinite(M).all():
+        return np.full(len(values), np.inf)
+    excess = values[:, T:] - values[:, :-T] @ M.T.astype(values.dtype) - delta[None, None]
+    worst = np.max(excess, axis=(1, 2))
+    return np.where(np.isnan(worst), np.inf, worst)

@@ -1,0 +1,105 @@
+"""C6: does the team still arrive when the game is not quite the one it was made for?"""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from marlyap.certificate import (
+    AbstractCertificate,
+    Evidence,
+    Verdict,
+    at_least,
+    enough,
+    judged,
+    scope,
+    worst_of,
+)
+from marlyap.certificates.reach import Reach
+from marlyap.game import AbstractGame
+from marlyap.perturb import Perturbed, edge_to_cut, follower_to_lose, traced
+from marlyap.rollout import Controller
+from marlyap.statistics import bonferroni
+
+
+class Robustness(AbstractCertificate):
+    """C6. With the confidence asked for, for all perturbations w together, over s_0 ~ rho,
+
+        P[ distance_i(s_H) <= r for every agent i | w ] >= bound_w,
+
+    which is C1 once for every perturbation. It holds if every bound reaches the share asked for;
+    the figures are the curve. A perturbation is one fixed change, not the worst of a set.
+    """
+
+    rollouts: int = 2_000
+    gains: tuple[float, ...] = (0.5, 0.75, 1.5, 2.0)
+    noises: tuple[float, ...] = (0.1, 0.3)
+    delays: tuple[int, ...] = (1, 2, 3)
+    drops: tuple[float, ...] = (0.1, 0.3)
+    spreads: tuple[float, ...] = (1.5,)
+    remove: bool = True  # whether to take away an agent and an edge
+    share: float = 0.9
+    confidence: float = 0.999
+    evidence: ClassVar[Evidence] = "statistical"
+
+    def check(self, game, controller, V, seed):
+        curve = self.perturbations(game)
+        each = bonferroni(self.confidence, len(curve))
+        enough(self.rollouts, self.share, each)
+        points, weakest = [], None
+        for name, change in curve.items():
+            point = self.point(traced(Perturbed(inner=game, **change)), controller, V, seed, each)
+            points.append({"perturbation": name, "change": change} | point)
+            if weakest is None or point["successes"] < weakest["successes"]:
+                weakest = points[-1]
+        least = min(p["bound"] for p in points)
+        return Verdict(
+            name="robustness",
+            claim=f"under each of {len(points)} perturbations, from at least a share {least:.4f} "
+            f"of the starts every agent is within {game.radius:g} m of its goal at "
+            f"{game.horizon * game.dt:g} s",
+            evidence=self.evidence,
+            holds=all(p["holds"] for p in points),
+            bound=least,
+            confidence=self.confidence,
+            scope=scope(game, game.horizon, "each of the perturbations in turn"),
+            trials=self.rollouts * len(points),
+            successes=sum(p["successes"] for p in points),
+            worst=None if weakest is None else weakest["worst"] | {"change": weakest["change"]},
+            figures={"share_asked": self.share, "confidence_each": each, "curve": points},
+        )
+
+    def point(
+        self, game: Perturbed, controller: Controller, V: Any, seed: int, each: float
+    ) -> dict[str, Any]:
+        """C1 under one perturbation."""
+        n, H = self.rollouts, game.horizon
+        driver = moved(controller, game)
+        found = judged(Reach().judge, game, driver, V, seed, "certify", n, H)
+        k = int(found.holds.sum())
+        bound, holds = at_least(k, n, self.share, each)
+        worst = worst_of(game, seed, "certify", found)
+        return {"trials": n, "successes": k, "bound": bound, "holds": holds, "worst": worst}
+
+    def perturbations(self, game: AbstractGame) -> dict[str, dict[str, Any]]:
+        """Name and fields of `Perturbed`, for each point of the curve."""
+        curve: dict[str, dict[str, Any]] = {f"gain {x:g}": {"gain": x} for x in self.gains}
+        curve |= {f"action noise {x:g}": {"noise": x} for x in self.noises}
+        curve |= {f"delay {x} steps": {"delay": x} for x in self.delays}
+        curve |= {f"starts {x:g} times as far": {"spread": x} for x in self.spreads}
+        if game.agents > 1:
+            curve |= {f"messages lost {x:g}": {"drop": x} for x in self.drops}
+        lost, edge = follower_to_lose(game), edge_to_cut(game)
+        if self.remove and lost is not None:
+            curve[f"without agent {lost}"] = {"gone": (lost,)}
+        if self.remove and edge is not None:
+            curve[f"without edge {edge[0]}-{edge[1]}"] = {"cut": (edge,)}
+        return curve
+
+
+def moved(controller: Controller, game: Perturbed) -> Controller:
+    """The controller with the perturbed game's eyes, but the nominal limits that it was told."""
+    if not isinstance(getattr(controller, "game", None), AbstractGame):
+        return controller
+    eyes = eqx.tree_at(lambda g: g.gain, game, jnp.asarray(1.0))
+    return eqx.tree_at(lambda c: c.game, controller, eyes)  # pyright: ignore
