@@ -56,7 +56,7 @@ def parser() -> Parser:
 
     p = verb("demo", "train, evaluate and report the main task, from nothing to a film")
     p.add_argument("--out", type=Path, default=Path("runs/demo"), help="directory of the runs")
-    p.add_argument("--seeds", nargs="+", default=["0", "1"], help="training seeds (default 0 1)")
+    p.add_argument("--seeds", nargs="+", default=["0"], help="training seeds (default 0)")
     p.add_argument("--steps", type=int, default=None, help="environment steps of each")
     p.add_argument("--again", action="store_true", help="train anew what is there already")
 
@@ -80,6 +80,20 @@ def parser() -> Parser:
     p.add_argument("--episodes", type=int, default=500, help="fresh starts (default 500)")
     p.add_argument("--seed", type=int, default=0, help="of the starts (default 0)")
     p.add_argument("--confidence", type=float, default=0.95, help="of the intervals")
+
+    p = verb("certify", "say what holds of a run or controller, with what evidence", OVERRIDES)
+    p.add_argument("run", metavar="RUN", help="a run directory or a controller name")
+    p.add_argument("--task", default=None, help="the task, for controllers or tasks of your own")
+    p.add_argument("--algorithm", default=None, help="the algorithm, where it is your own code")
+    p.add_argument("--certificates", nargs="+", default=None, help="names (default: the sampled)")
+    p.add_argument("--rollouts", type=int, default=10_000, help="fresh starts (default 10000)")
+    p.add_argument("--confidence", type=float, default=0.999, help="of all claims together")
+    p.add_argument("--seed", type=int, default=0, help="of the starts (default 0)")
+    p.add_argument("--out", type=Path, default=None, help="directory (default RUN/certificate)")
+    p.add_argument("--force", action="store_true", help="overwrite a certificate that is there")
+
+    p = verb("recheck", "derive every figure of a certificate again, without JAX")
+    p.add_argument("certificate", type=Path, metavar="CERTIFICATE", help="what certify wrote")
 
     p = verb("report", "write one HTML file (and PNGs) about runs")
     p.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run directories")
@@ -162,6 +176,8 @@ def prepare(args: Any) -> None:
     if device:
         os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": "cuda"}[device]
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_directory()))
+    if args.verb in ("demo", "train"):
+        os.environ.setdefault("NPROC", "1")  # products this small lose time to a second thread
     core = os.environ.get("MARLYAP_CORE")
     if core and core.isdigit() and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {int(core)})

@@ -1,5 +1,6 @@
 """What the verbs of the command line do."""
 
+import dataclasses
 import json
 import shlex
 import sys
@@ -15,10 +16,13 @@ from rich.table import Table
 from marlyap import config, film, store
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.algorithms import ALGORITHMS, MASAC, PRESETS
+from marlyap.certificates import CERTIFICATES
+from marlyap.certify import certify, save
 from marlyap.controllers import CONTROLLERS
 from marlyap.errors import UserError
 from marlyap.evaluate import Evaluation, compare, evaluate, pooled
 from marlyap.game import AbstractGame
+from marlyap.recheck import recheck
 from marlyap.report import Film, Page, html
 from marlyap.run import Run, expand
 from marlyap.tasks import TASKS
@@ -227,6 +231,51 @@ def tabulate(
         console.print(text, highlight=False)
 
 
+SAMPLED = ("reach", "reach-and-stay", "decrease", "contraction", "basin", "quantiles")
+
+
+def certification(args: Namespace, overrides: Overrides) -> Result:
+    """`certify`: the verdicts of several certificates on one controller, stored to be rechecked."""
+    if not 0 < args.confidence < 1:
+        raise UserError(f"confidence: {args.confidence} must lie between 0 and 1.")
+    game, algorithm = own_code(args, overrides)
+    out = args.out
+    if args.run in CONTROLLERS:
+        if game is None or out is None:
+            raise UserError(f"certify: {args.run} needs --task TASK and --out DIRECTORY.")
+        controller: Any = CONTROLLERS[args.run](game)
+    else:
+        run = Run.open(expand([Path(args.run)])[0], game, algorithm)
+        game, controller = run.game, run.controller()
+        out = out or run.directory / "certificate"
+    if out.exists() and not args.force:
+        raise UserError(f"out: {out} already exists; choose another or add --force.")
+    chosen = {}
+    for name in args.certificates or (*SAMPLED, "linearisation"):
+        if name not in CERTIFICATES:
+            hint = config.suggest(name, CERTIFICATES)
+            raise UserError(f"certificates: there is none called '{name}'; {hint}")
+        c = CERTIFICATES[name]
+        several = "rollouts" in config.fields(c)
+        chosen[name] = dataclasses.replace(c, rollouts=args.rollouts) if several else c  # pyright: ignore
+    result = certify(game, controller, chosen, args.seed, args.confidence)
+    save(out, result, game, controller, replace=args.force)
+    if not args.json:
+        for verdict in result["verdicts"].values():
+            mark = "holds" if verdict["holds"] else "does not hold"
+            print(f"[{verdict['evidence']}] {verdict['claim']}: {mark}.")
+    say(f"Certificate: {out}")
+    return result | {"certificate": str(out)}, 0
+
+
+def recheck_certificate(args: Namespace, overrides: Overrides) -> Result:
+    """`recheck`: reject the certificate or confirm its figures."""
+    result = recheck(args.certificate)
+    if not args.json:
+        print(f"{args.certificate}: every sampled figure was derived again and agrees.")
+    return result, 0
+
+
 def report(args: Namespace, overrides: Overrides) -> Result:
     """Write the HTML page and the pictures."""
     game, algorithm = own_code(args, overrides)
@@ -374,6 +423,8 @@ VERBS: dict[str, Callable[[Namespace, Overrides], Result]] = {
     "demo": demo,
     "train": train,
     "evaluate": measure,
+    "certify": certification,
+    "recheck": recheck_certificate,
     "report": report,
     "watch": watch,
     "list": listing,

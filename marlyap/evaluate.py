@@ -14,7 +14,7 @@ from marlyap.game import AbstractGame
 from marlyap.rollout import Controller, rollout
 from marlyap.seeds import Purpose, stream
 from marlyap.statistics import clopper_pearson, mcnemar
-from marlyap.types import Key, Scalar, Trajectory
+from marlyap.types import Key, Keys, Scalar, Trajectory
 
 
 RADII = (0.05, 0.1, 0.15, 0.2, 0.3)  # m, for the success curve
@@ -55,15 +55,9 @@ def episode(game: AbstractGame, controller: Controller, key: Key) -> Trajectory:
 
 
 @eqx.filter_jit
-def outcomes(game: AbstractGame, controller: Controller, keys: Key) -> Outcome:
+def outcomes(game: AbstractGame, controller: Controller, keys: Keys) -> Outcome:
     """One outcome for every key."""
     return jax.vmap(lambda k: outcome(game, episode(game, controller, k)))(keys)
-
-
-@eqx.filter_jit
-def trajectories(game: AbstractGame, controller: Controller, keys: Key) -> Trajectory:
-    """The whole episodes, for pictures."""
-    return jax.vmap(lambda k: episode(game, controller, k))(keys)
 
 
 class Evaluation(eqx.Module):

@@ -5,10 +5,12 @@ agent), `obs` (what one agent sees), `feature` (what the central critic sees of 
 """
 
 import equinox as eqx
+import jaxtyping
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 
 Key = PRNGKeyArray
+Keys = jaxtyping.Key[Array, "episode"]
 Scalar = Float[Array, ""]
 Action = Float[Array, "agent du"]
 Obs = Float[Array, "agent obs"]
