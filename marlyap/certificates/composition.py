@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import linprog
 
+from marlyap import graph as graphs
 from marlyap.certificate import (
     AbstractCertificate,
     Evidence,
@@ -28,6 +29,9 @@ class Composition(AbstractCertificate):
 
         V_i(s_{t+T}) <= (1 - a_i) V_i(s_t) + sum_j Gamma_ij V_j(s_t) + delta_i  for all i, t   (*)
         rho(M) < 1  =>  limsup V <= (I - M)^-1 delta, componentwise (the ultimate bound).
+
+    Two shapes of M are tried: all neighbours, and only those nearer to a leader, which makes M
+    triangular, so that rho(M) is the largest 1 - a_i whatever the gains.
 
     M and delta come from one linear programme per agent on one set of rollouts, with delta enlarged
     by `slack`. With the confidence asked for, P[ (*) holds along the whole rollout ] >= bound on
@@ -92,15 +96,18 @@ class Composition(AbstractCertificate):
         best = np.full((N, N), np.inf), np.full(N, np.inf), np.full(N, np.inf)
         if len(values) == 0:
             return best
-        for weight in self.weights:
-            rows = [fit_row(game, values, self.T, i, weight) for i in range(N)]
-            M = np.stack([row for row, _ in rows])
-            delta = np.array([(1 + self.slack) * d for _, d in rows]) + 1e-6
-            if np.max(np.abs(np.linalg.eigvals(M))) >= 1 - 1e-6:
-                continue
-            ultimate = np.linalg.solve(np.eye(N) - M, delta)
-            if np.max(ultimate) < np.max(best[2]):
-                best = M, delta, ultimate
+        hops = graphs.hops(game.adjacency, game.leaders)
+        upstream = game.adjacency & (hops[None, :] < hops[:, None])
+        for linked in (upstream, game.adjacency):
+            for weight in self.weights:
+                rows = [fit_row(linked, values, self.T, i, weight) for i in range(N)]
+                M = np.stack([row for row, _ in rows])
+                delta = np.array([(1 + self.slack) * d for _, d in rows]) + 1e-6
+                if np.max(np.abs(np.linalg.eigvals(M))) >= 1 - 1e-6:
+                    continue
+                ultimate = np.linalg.solve(np.eye(N) - M, delta)
+                if np.max(ultimate) < np.max(best[2]):
+                    best = M, delta, ultimate
         return best
 
 
@@ -118,13 +125,13 @@ class _Windows(eqx.Module):
 
 
 def fit_row(
-    game: AbstractGame, values: np.ndarray, T: int, i: int, weight: float, rounds: int = 30
+    linked: np.ndarray, values: np.ndarray, T: int, i: int, weight: float, rounds: int = 30
 ) -> tuple[np.ndarray, float]:
     """min delta + weight sum_j M_ij  so that (*) holds for agent i on all transitions.
 
     Of the millions of inequalities a handful binds: they are added as they turn out violated.
     """
-    who = [i, *(int(j) for j in np.flatnonzero(game.adjacency[i]))]
+    who = [i, *(int(j) for j in np.flatnonzero(linked[i]))]
     now = values[:, :-T][..., who].reshape(-1, len(who))
     ahead = values[:, T:, i].ravel()
     pick = np.linspace(0, len(ahead) - 1, min(500, len(ahead))).astype(int)
@@ -142,7 +149,7 @@ def fit_row(
     delta = float(
         solution[-1] + max(0.0, float(np.max(ahead - now @ solution[:-1] - solution[-1])))
     )
-    row = np.zeros(game.agents)
+    row = np.zeros(len(linked))
     row[who] = solution[:-1]
     return row, delta
 
