@@ -1,4 +1,4 @@
-"""MASAC with and without the Lyapunov term, many seeds: learning curves and success over 500 starts.
+"""MASAC with and without the Lyapunov term, many seeds: learning curves, success over 500 starts.
 
     ./run python experiments/headline.py            ten seeds of each (about an hour on two cores)
     ./run python experiments/headline.py --quick    a minute, to see that it works

@@ -40,7 +40,7 @@ PUBLIC = {
     "types": ("State",),
 }
 _HOME = {name: module for module, names in PUBLIC.items() for name in names}
-__all__ = sorted(_HOME)
+__all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

@@ -30,7 +30,7 @@ class AbstractAlgorithm(eqx.Module):
     def update(
         self, learner: PyTree, b: Transition, key: Key, decay: Scalar
     ) -> tuple[PyTree, dict[str, Scalar]]:
-        """One gradient step on a batch, its rates multiplied by `decay`; the dict is for the log."""
+        """One gradient step on a batch, rates multiplied by `decay`; the dict is for the log."""
 
     @abc.abstractmethod
     def explore(self, learner: PyTree) -> AbstractExplorer:

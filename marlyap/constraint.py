@@ -11,7 +11,7 @@ from marlyap.types import Key, Scalar, Transition
 
 
 class AbstractConstraint(eqx.Module):
-    """A term of the policy objective (`penalty`) and how what it is made of is learnt (`update`)."""
+    """A term of the policy objective (`penalty`) and how its parts are learnt (`update`)."""
 
     @property
     @abc.abstractmethod

@@ -30,6 +30,7 @@ from marlyap.report import (
     ticks,
 )
 
+
 PAPER, INK, SOFT, RULE, FAINT = "#ffffff", "#1c1d20", "#5e6169", "#dddcd6", "#ecebe6"
 Key = Literal["success", "return"]
 SHARP = 2  # drawn so many times larger, then reduced, for smooth lines

@@ -1,8 +1,8 @@
 """The interaction graph G = <I, E> of section 2.1: undirected, connected, written as text.
 
-    complete | path | ring | star      named graphs on n agents
-    disk:0.8                           neighbours are those closer than 0.8 m at this instant
-    0-1,1-2,1-3                        any edge list
+complete | path | ring | star      named graphs on n agents
+disk:0.8                           neighbours are those closer than 0.8 m at this instant
+0-1,1-2,1-3                        any edge list
 """
 
 import re

@@ -72,9 +72,7 @@ def rollout(
     keys = jax.random.split(key, steps or game.horizon)
     _, (after, action, reward, cost, terminated) = jax.lax.scan(tick, start, keys)
     states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, after)
-    return Trajectory(
-        action=action, reward=reward, cost=cost, state=states, terminated=terminated
-    )
+    return Trajectory(action=action, reward=reward, cost=cost, state=states, terminated=terminated)
 
 
 def cost_to_go(

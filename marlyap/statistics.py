@@ -11,6 +11,7 @@ from scipy import special
 
 from marlyap.errors import UserError
 
+
 Counts = int | float | Num[np.ndarray, "..."]
 Reals = float | Float[np.ndarray, "..."]
 
@@ -323,7 +324,7 @@ def quantile_upper_bound(sample: Float[np.ndarray, "n"], q: float, confidence: f
     It is the j-th smallest value, for the smallest j with P(Binomial(n, q) <= j - 1) >= confidence,
     and infinity when n is too small for any j (n = 58 at q = confidence = 0.95, but not 59).
 
-    Arguments: sample, Float["n"], independent draws, infinities allowed; q and confidence in (0, 1).
+    Arguments: sample, Float["n"], independent, infinities allowed; q and confidence in (0, 1).
     Raises: StatisticsError (a UserError and a ValueError) when sample is empty, not a vector or
     holds NaN, or when q or confidence is outside (0, 1).
     Source: Wilks, "Determination of sample sizes for setting tolerance limits", Annals of
@@ -339,7 +340,7 @@ def quantile_upper_bound(sample: Float[np.ndarray, "n"], q: float, confidence: f
 def bonferroni(confidence: float, claims: int) -> float:
     """The confidence each of several claims needs for all to hold together at `confidence`.
 
-    Arguments: confidence in (0, 1); claims, a whole number of at least 1. Returns a float in (0, 1).
+    Arguments: confidence in (0, 1); claims, a whole number from 1. Returns a float in (0, 1).
     Raises: StatisticsError (a UserError and a ValueError) when either breaks its limit.
     Source: Dunn, "Multiple comparisons among means", JASA 56, 1961.
     """

@@ -13,6 +13,7 @@ import pytest
 
 from marlyap import draw, report
 
+
 HOSTILE = '</script><img onerror=alert(1) src=x> & "quoted" <!--#films-->'
 
 

@@ -23,6 +23,7 @@ from marlyap.statistics import (
     wilson,
 )
 
+
 # Newcombe, Statistics in Medicine 17, 1998, table I (methods 5 and 3), and the usual n = 10 table.
 PUBLISHED = [
     # k, n, exact interval, score interval
