@@ -50,7 +50,7 @@ def body_frame(
 
     def of(i, slot, lead):
         there = (slot >= 0) & linked[i, slot]
-        gap = into_frame(h[i], p[slot] - p[i])
+        gap = into_frame(h[i], p[slot] - p[i][None])
         seen = [gap, near(gap, scale), into_frame(h[i], v[slot])]
         if headings:
             seen.append(into_frame(h[i], h[slot]))

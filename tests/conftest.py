@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 
-jax.config.update("jax_numpy_rank_promotion", "allow")  # "raise" once the package allows it
+jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
 def keep_compiled_code():
