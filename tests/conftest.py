@@ -38,16 +38,21 @@ def single_precision():
     assert not jax.config.jax_enable_x64
 
 
-def shaken(tree, seed=0, by=0.3):
-    """The same tree with noise on every float, so that no two parts of it are equal by birth."""
+def filled(make, *args, seed=0):
+    """What `make(*args)` returns, every float random: nothing is equal by birth or compiled."""
+    import equinox as eqx
+
     rng = np.random.default_rng(seed)
 
-    def shake(leaf):
-        if not isinstance(leaf, jax.Array) or not jnp.issubdtype(leaf.dtype, jnp.floating):
+    def fill(leaf):
+        if not isinstance(leaf, jax.ShapeDtypeStruct):
             return leaf
-        return leaf + by * jnp.asarray(rng.standard_normal(leaf.shape), leaf.dtype)
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            return jnp.asarray(np.zeros(leaf.shape, leaf.dtype))
+        scale = max(leaf.shape[-1:], default=1) ** -0.5 if leaf.ndim > 1 else 0.5
+        return jnp.asarray(np.asarray(rng.standard_normal(leaf.shape) * scale, leaf.dtype))
 
-    return jax.tree.map(shake, tree)
+    return jax.tree.map(fill, eqx.filter_eval_shape(make, *args))
 
 
 def same(a, b):
@@ -73,26 +78,6 @@ def game():
     from marlyap.tasks.rendezvous import Rendezvous
 
     return Rendezvous(graph="path", horizon=6)
-
-
-@pytest.fixture(scope="session")
-def games():
-    """Rendezvous on every kind of graph, with every dynamics, by name."""
-    from marlyap.dynamics import DoubleIntegrator, SingleIntegrator, Unicycle
-    from marlyap.tasks.rendezvous import Rendezvous
-
-    return {
-        "complete": Rendezvous(),
-        "path": Rendezvous(agents=5, graph="path", leaders=(0, 3)),
-        "ring": Rendezvous(agents=4, graph="ring", leaders=(2,)),
-        "star": Rendezvous(agents=4, graph="star", size=2.5, dynamics=DoubleIntegrator()),
-        "disk": Rendezvous(agents=4, graph="disk:0.9", headings=True),
-        "edges": Rendezvous(
-            agents=4, graph="0-2,2-1,2-3", dynamics=SingleIntegrator(limits=(2.0, 0.5))
-        ),
-        "rk4": Rendezvous(agents=2, headings=True, dynamics=Unicycle((2.0, 3.0), "rk4")),
-        "alone": Rendezvous(agents=1),
-    }
 
 
 @pytest.fixture(scope="session")
@@ -133,12 +118,51 @@ def masac():
     from marlyap.algorithms.masac import MASAC
     from marlyap.constraints.lyapunov import Lyapunov
 
-    return MASAC(actor_width=8, critic_width=8, batch=16, constraint=Lyapunov(horizon=3))
+    constraint = Lyapunov(horizon=3, weight=None)
+    return MASAC(
+        actor_width=8,
+        critic_width=8,
+        batch=16,
+        normalise=True,
+        heads="team",
+        constraint=constraint,
+    )
+
+
+def level(critic, features, action):
+    """The same twins, one of them moved so that each is the smaller for half of a batch."""
+    import equinox as eqx
+
+    value = eqx.filter_jit(jax.vmap(critic))(features, action)
+    gap = jnp.median(value[:, 0] - value[:, 1], axis=0)
+    bias = lambda c: c.nets.layers[-1].bias
+    return eqx.tree_at(bias, critic, bias(critic).at[0].add(-gap))
 
 
 @pytest.fixture(scope="session")
-def learner(masac, shape):
-    """Its learner in mid-training: targets lag, temperature and norms have moved."""
+def learner(masac, shape, batch):
+    """Its learner in mid-training: targets lag, norms and temperature have moved; Adam is fresh."""
     import equinox as eqx
 
-    return shaken(eqx.filter_jit(masac.init)(shape, jax.random.key(0)))
+    from marlyap.learn import Learnt
+
+    l = filled(masac.init, shape, jax.random.key(0))
+    number = lambda x: jnp.asarray(x, jnp.float32)
+    fresh = lambda learnt: Learnt.of(learnt.value)
+    L = l.L
+    L = eqx.tree_at(
+        lambda L: (L.net, L.log_weight, L.gradient, L.scale),
+        L,
+        (fresh(L.net), Learnt.of(number(np.log(0.3))), number(0.8), number(1.7)),
+    )
+    l = eqx.tree_at(lambda l: l.Q_bar, l, level(l.Q_bar, batch.next_features, batch.action))
+    return eqx.tree_at(
+        lambda l: (l.pi, l.Q, l.log_alpha, l.L),
+        l,
+        (
+            fresh(l.pi),
+            Learnt.of(level(l.Q.value, batch.features, batch.action)),
+            Learnt.of(number(-1.2)),
+            L,
+        ),
+    )
