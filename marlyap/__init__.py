@@ -16,13 +16,13 @@ if TYPE_CHECKING:
         Unicycle as Unicycle,
     )
     from marlyap.errors import UserError as UserError
-    from marlyap.evaluate import compare as compare, evaluate as evaluate
-    from marlyap.fit import fit as fit, train as train
+    from marlyap.evaluation import compare as compare, evaluate as evaluate
+    from marlyap.fit import train as train
     from marlyap.game import AbstractGame as AbstractGame
-    from marlyap.rollout import Decentralised as Decentralised, rollout as rollout
+    from marlyap.rollout import Decentralised as Decentralised
     from marlyap.run import Run as Run
     from marlyap.tasks import Formation as Formation, Rendezvous as Rendezvous
-    from marlyap.train import Schedule as Schedule, Trainer as Trainer
+    from marlyap.trainer import Schedule as Schedule, Trainer as Trainer
     from marlyap.types import State as State
 
 PUBLIC = {
@@ -30,13 +30,13 @@ PUBLIC = {
     "constraints": ("Lyapunov", "Unconstrained"),
     "dynamics": ("DoubleIntegrator", "SingleIntegrator", "Unicycle"),
     "errors": ("UserError",),
-    "evaluate": ("compare", "evaluate"),
-    "fit": ("fit", "train"),
+    "evaluation": ("compare", "evaluate"),
+    "fit": ("train",),
     "game": ("AbstractGame",),
-    "rollout": ("Decentralised", "rollout"),
+    "rollout": ("Decentralised",),
     "run": ("Run",),
     "tasks": ("Formation", "Rendezvous"),
-    "train": ("Schedule", "Trainer"),
+    "trainer": ("Schedule", "Trainer"),
     "types": ("State",),
 }
 _HOME = {name: module for module, names in PUBLIC.items() for name in names}

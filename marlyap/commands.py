@@ -20,14 +20,14 @@ from marlyap.certificates import CERTIFICATES
 from marlyap.certify import certify, save
 from marlyap.controllers import CONTROLLERS
 from marlyap.errors import UserError
-from marlyap.evaluate import Evaluation, compare, evaluate, pooled
+from marlyap.evaluation import Evaluation, compare, evaluate, pooled
 from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import CostSum
 from marlyap.recheck import recheck
 from marlyap.report import Film, Page, html
 from marlyap.run import Run, expand
 from marlyap.tasks import TASKS
-from marlyap.train import SCHEDULES, Trainer
+from marlyap.trainer import SCHEDULES, Trainer
 from marlyap.workers import train_all
 
 

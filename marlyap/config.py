@@ -25,7 +25,7 @@ from marlyap.dynamics import DYNAMICS, AbstractDynamics
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.tasks import TASKS
-from marlyap.train import Schedule
+from marlyap.trainer import Schedule
 
 
 T = TypeVar("T")

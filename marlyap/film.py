@@ -10,7 +10,7 @@ import numpy as np
 
 from marlyap import config
 from marlyap.errors import UserError
-from marlyap.evaluate import Evaluation, episode, evaluate, pooled
+from marlyap.evaluation import Evaluation, episode, evaluate, pooled
 from marlyap.game import AbstractGame
 from marlyap.rollout import Controller
 from marlyap.run import Run, versions

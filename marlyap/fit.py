@@ -18,7 +18,7 @@ from marlyap.game import AbstractGame
 from marlyap.nets import LyapunovNet, NormNet
 from marlyap.rollout import Decentralised, Policy
 from marlyap.run import Run, begin
-from marlyap.train import SCHEDULES, Carry, Schedule, Trainer
+from marlyap.trainer import SCHEDULES, Carry, Schedule, Trainer
 
 
 SHARE = 0.02  # of the training time that checkpoints may take

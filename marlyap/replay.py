@@ -15,9 +15,9 @@ from marlyap.types import Key, Transition
 class Episode(eqx.Module):
     """What is remembered of one episode."""
 
+    action: Float[Array, "time agent du"]
     obs: Float[Array, "time+1 agent obs"]
     features: Float[Array, "time+1 agent feature"]
-    action: Float[Array, "time agent du"]
     log_prob: Float[Array, "time agent"]
     reward: Float[Array, "time agent"]
     cost: Float[Array, "time agent"]

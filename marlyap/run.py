@@ -29,7 +29,7 @@ from marlyap.game import AbstractGame
 from marlyap.nets import LyapunovNet, NormNet
 from marlyap.rollout import Decentralised, Policy
 from marlyap.seeds import stream
-from marlyap.train import Carry, Schedule, Trainer, shape
+from marlyap.trainer import Carry, Schedule, Trainer, shape
 
 
 SCHEMA = 1

@@ -15,7 +15,7 @@ from marlyap.dynamics import DYNAMICS, DoubleIntegrator, Unicycle
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.tasks import TASKS, Rendezvous
-from marlyap.train import SCHEDULES, Schedule
+from marlyap.trainer import SCHEDULES, Schedule
 
 
 GAME, RULE = Rendezvous(), MASAC(constraint=Lyapunov())

@@ -37,8 +37,8 @@ FLOORS = """
     constraints
     algorithms
     controllers
-    evaluate
-    train
+    evaluation
+    trainer
     lyapunov_function
     certificate
     certificates
@@ -48,6 +48,9 @@ FLOORS = """
     config
     run
     fit
+    film
+    workers
+    commands
     workers
     film
     commands
@@ -138,15 +141,15 @@ def later():
     found = imported(ROOT / "train.py", ast.parse(source))
     assert found == {
         "marlyap.store", "marlyap.graph", "marlyap.errors", "marlyap.types",
-        "marlyap.evaluate", "marlyap.algorithms.masac", "os.path",
+        "marlyap.evaluation", "marlyap.algorithms.masac", "os.path",
     }  # fmt: skip
 
 
 def test_an_upward_import_is_noticed(monkeypatch):
     file = ROOT / "game.py"
-    bad = ast.parse("def f():\n    from marlyap.train import Trainer\n")
+    bad = ast.parse("def f():\n    from marlyap.trainer import Trainer\n")
     monkeypatch.setitem(TREES, file, bad)
-    with pytest.raises(AssertionError, match=re.escape("marlyap.game imports marlyap.train")):
+    with pytest.raises(AssertionError, match=re.escape("marlyap.game imports marlyap.trainer")):
         test_imports_only_go_down(file)
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Array, Int, PyTree
 
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.errors import UserError
-from marlyap.evaluate import outcomes
+from marlyap.evaluation import outcomes
 from marlyap.game import AbstractGame
 from marlyap.nets import Shape
 from marlyap.replay import Episode, Replay
