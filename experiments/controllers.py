@@ -16,7 +16,7 @@ import numpy as np
 
 from marlyap.controllers import CONTROLLERS, Cascade, Replayed, plan
 from marlyap.dynamics import Unicycle
-from marlyap.evaluate import RADII, evaluate, outcome, share
+from marlyap.evaluation import RADII, evaluate, outcome, share
 from marlyap.rollout import rollout
 from marlyap.seeds import stream
 from marlyap.tasks.rendezvous import Rendezvous

@@ -33,7 +33,7 @@ from marlyap.workers import train_all
 
 Result = tuple[dict[str, Any] | None, int]
 Overrides = dict[str, str]
-DEMO_STEPS = 163_840
+DEMO_STEPS = 204_800
 
 
 def train(args: Namespace, overrides: Overrides) -> Result:

@@ -2,18 +2,18 @@
 
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Num
 from scipy import special
 
 from marlyap.errors import UserError
 
 
-Counts = int | float | Num[np.ndarray, "..."]
-Reals = float | Float[np.ndarray, "..."]
+# These functions say themselves what is wrong with their arguments, in one sentence.
+Counts = Any  # int, float or Num["..."]
+Reals = Any  # float, or Float["..."] where arrays went in
 
 _BLOCK = 4_000_000  # Most episode draws held in memory at once by the two-level bootstrap.
 
@@ -44,13 +44,13 @@ class Improvement(NamedTuple):
     interval: Interval
 
 
-def _fraction(name: str, value: float) -> float:
+def _fraction(name: str, value: Any) -> float:
     if not 0.0 < value < 1.0:  # Written so that NaN fails too.
         raise StatisticsError(f"{name} must lie strictly between 0 and 1, but is {value}.")
     return float(value)
 
 
-def _positive_integer(name: str, value: int) -> int:
+def _positive_integer(name: str, value: Any) -> int:
     try:
         whole = operator.index(value)
     except TypeError:
@@ -100,7 +100,7 @@ def _numbers(name: str, value: Any, ndim: int | None, least: int, finite: bool) 
     return array
 
 
-def _scalar(array: np.ndarray) -> Reals:
+def _scalar(array: Any) -> Any:
     return float(array) if np.ndim(array) == 0 else array
 
 
@@ -114,13 +114,13 @@ def _upper(k: np.ndarray, n: np.ndarray, tail: float) -> Reals:
     return _scalar(np.where(k == n, 1.0, inner))
 
 
-def _percentiles(replicates: np.ndarray, confidence: float) -> Interval:
+def _percentiles(replicates: np.ndarray, confidence: Any) -> Interval:
     tail = (1.0 - confidence) / 2.0
     low, high = np.quantile(replicates, [tail, 1.0 - tail])
     return Interval(float(low), float(high))
 
 
-def lower_bound(successes: Counts, trials: Counts, confidence: float) -> Reals:
+def lower_bound(successes: Counts, trials: Counts, confidence: Any) -> Reals:
     """Exact one-sided lower confidence bound on a success probability.
 
     The p at which P(X >= successes) equals 1 - confidence; 0 when successes = 0.
@@ -136,7 +136,7 @@ def lower_bound(successes: Counts, trials: Counts, confidence: float) -> Reals:
     return _lower(k, n, 1.0 - _fraction("confidence", confidence))
 
 
-def upper_bound(successes: Counts, trials: Counts, confidence: float) -> Reals:
+def upper_bound(successes: Counts, trials: Counts, confidence: Any) -> Reals:
     """Exact one-sided upper confidence bound on a success probability.
 
     The p at which P(X <= successes) equals 1 - confidence; 1 when successes = trials.
@@ -146,7 +146,7 @@ def upper_bound(successes: Counts, trials: Counts, confidence: float) -> Reals:
     return _upper(k, n, 1.0 - _fraction("confidence", confidence))
 
 
-def clopper_pearson(successes: Counts, trials: Counts, confidence: float = 0.95) -> Interval:
+def clopper_pearson(successes: Counts, trials: Counts, confidence: Any = 0.95) -> Interval:
     """Exact two-sided interval on a success probability, with (1 - confidence) / 2 in each tail.
 
     Arguments, shapes, errors raised and source are those of `lower_bound`; both ends of the
@@ -158,7 +158,7 @@ def clopper_pearson(successes: Counts, trials: Counts, confidence: float = 0.95)
     return Interval(_lower(k, n, tail), _upper(k, n, tail))
 
 
-def trials_needed(epsilon: float, confidence: float) -> int:
+def trials_needed(epsilon: Any, confidence: Any) -> int:
     """The fewest trials, all without failure, that bound the failure probability by epsilon.
 
     The smallest n with (1 - epsilon) ** n <= 1 - confidence, where
@@ -174,7 +174,7 @@ def trials_needed(epsilon: float, confidence: float) -> int:
     return max(1, math.ceil(ratio * (1.0 - 1e-12)))
 
 
-def wilson(successes: Counts, trials: Counts, confidence: float = 0.95) -> Interval:
+def wilson(successes: Counts, trials: Counts, confidence: Any = 0.95) -> Interval:
     """Score interval on a success probability: shorter than the exact one, nominal on average only.
 
     Arguments, shapes and errors raised are those of `lower_bound`. It has no continuity correction.
@@ -189,7 +189,7 @@ def wilson(successes: Counts, trials: Counts, confidence: float = 0.95) -> Inter
     return Interval(_scalar(centre - half), _scalar(high))
 
 
-def mcnemar(a: Bool[np.ndarray, "n"], b: Bool[np.ndarray, "n"]) -> PairedTest:
+def mcnemar(a: Any, b: Any) -> PairedTest:
     """Exact two-sided test that two methods succeed equally often on the same n cases.
 
     Only the pairs where the two differ count: under the null, each falls to a with probability 1/2.
@@ -213,7 +213,7 @@ def mcnemar(a: Bool[np.ndarray, "n"], b: Bool[np.ndarray, "n"]) -> PairedTest:
     return PairedTest(only_a, only_b, min(1.0, 2.0 * float(tail)))
 
 
-def iqm(scores: Float[np.ndarray, "..."]) -> float:
+def iqm(scores: Any) -> float:
     """Interquartile mean of all the scores together.
 
     As rliable does with `scipy.stats.trim_mean(scores, 0.25, axis=None)`, it drops the floor(n / 4)
@@ -231,11 +231,11 @@ def iqm(scores: Float[np.ndarray, "..."]) -> float:
 
 
 def stratified_bootstrap(
-    scores: Float[np.ndarray, "run task"],
-    statistic: Callable[[Float[np.ndarray, "run task"]], float] = iqm,
-    confidence: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
+    scores: Any,
+    statistic: Callable[[Any], float] = iqm,
+    confidence: Any = 0.95,
+    resamples: Any = 2000,
+    seed: Any = 0,
 ) -> Interval:
     """Percentile bootstrap interval that resamples the runs of each task on their own.
 
@@ -258,11 +258,11 @@ def stratified_bootstrap(
 
 
 def two_level_bootstrap(
-    outcomes: Float[np.ndarray, "seed episode"] | Sequence[Float[np.ndarray, "episode"]],
-    statistic: Callable[[Float[np.ndarray, "seed"]], float] = iqm,
-    confidence: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
+    outcomes: Any,
+    statistic: Callable[[Any], float] = iqm,
+    confidence: Any = 0.95,
+    resamples: Any = 2000,
+    seed: Any = 0,
 ) -> Interval:
     """Percentile bootstrap interval that resamples training seeds, then episodes within each.
 
@@ -291,11 +291,11 @@ def two_level_bootstrap(
 
 
 def probability_of_improvement(
-    a: Float[np.ndarray, "seed_a"],
-    b: Float[np.ndarray, "seed_b"],
-    confidence: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
+    a: Any,
+    b: Any,
+    confidence: Any = 0.95,
+    resamples: Any = 2000,
+    seed: Any = 0,
 ) -> Improvement:
     """How likely a random run of a scores above a random run of b, ties counted as one half.
 
@@ -318,7 +318,7 @@ def probability_of_improvement(
     return Improvement(float(wins.mean()), _percentiles(replicates, confidence))
 
 
-def quantile_upper_bound(sample: Float[np.ndarray, "n"], q: float, confidence: float) -> float:
+def quantile_upper_bound(sample: Any, q: Any, confidence: Any) -> float:
     """Distribution-free one-sided upper confidence bound on the q-quantile.
 
     It is the j-th smallest value, for the smallest j with P(Binomial(n, q) <= j - 1) >= confidence,
@@ -337,7 +337,7 @@ def quantile_upper_bound(sample: Float[np.ndarray, "n"], q: float, confidence: f
     return float(ordered[index]) if index < ordered.size else math.inf
 
 
-def bonferroni(confidence: float, claims: int) -> float:
+def bonferroni(confidence: Any, claims: Any) -> float:
     """The confidence each of several claims needs for all to hold together at `confidence`.
 
     Arguments: confidence in (0, 1); claims, a whole number from 1. Returns a float in (0, 1).

@@ -1,6 +1,8 @@
 """The command line: help at once, one sentence for bad input, one JSON object for machines."""
 
+import contextlib
 import importlib
+import io
 import json
 import os
 import resource
@@ -13,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap import store
+from marlyap import config, store
 from marlyap.cli import main, parser
+from marlyap.game import AbstractGame
 from marlyap.run import Run
 
 
@@ -82,19 +85,10 @@ def trained(tmp_path_factory):
         patch.setattr(FIT, "PATIENCE", 0.0)
         patch.setattr(FIT, "SHARE", 1e9)
         command = ["train", "rendezvous", "masac-lyapunov", "--out", str(out), "--json", *TINY]
-        run = subprocess_like(command)
-    return out, run
-
-
-def subprocess_like(argv):
-    """What `main` prints on standard output, where capsys cannot be had."""
-    import contextlib
-    import io
-
-    text = io.StringIO()
-    with contextlib.redirect_stdout(text):
-        assert main(argv) == 0
-    return text.getvalue()
+        text = io.StringIO()
+        with contextlib.redirect_stdout(text):
+            assert main(command) == 0
+    return out, text.getvalue()
 
 
 @pytest.fixture
@@ -454,10 +448,8 @@ def test_a_finished_run_is_left_as_it_is(run, capsys):
 
 
 def test_the_same_run_twice_is_refused(run, capsys):
-    for verb in (["train", "--resume"], ["evaluate"], ["report"]):
-        words = [*verb, run, run] if verb[0] != "evaluate" else None
-        if words:
-            refused(capsys, *words, parts=["given twice"])
+    for verb in (["train", "--resume"], ["report"]):
+        refused(capsys, *verb, run, run, parts=["given twice"])
 
 
 @known_bug("measure expands each word alone, so a run given twice counts twice in the pool")
@@ -499,16 +491,13 @@ def test_nan_from_a_users_task_is_named_and_the_last_checkpoint_is_intact(
 ):
     monkeypatch.setattr(FIT, "PATIENCE", 0.0)
     monkeypatch.setattr(FIT, "SHARE", 1e9)
-    command = ["train", own, "masac", "--out", "out", "--seeds", "3", *TINY, "--task.edge", "0.6"]
-    err = refused(capsys, *command, parts=["the task returned a number", "(seed 3)", "mend"])
+    command = ["train", own, "masac", "--out", "out", *TINY, "--task.edge", "0.6"]
+    err = refused(capsys, *command, parts=["the task returned a number", "(seed 0)", "mend"])
     assert "marlyap: cost" in err or "marlyap: reward" in err
-    run = tmp_path / "out" / "seed3"
+    run = tmp_path / "out" / "seed0"
     at = int(err.split("in iteration ")[1].split()[0])
     assert at >= 2, "choose a seed whose first starts are sound"
     assert [line["iteration"] for line in store.read_jsonl(run / "log.jsonl")] == [*range(1, at)]
-
-    from marlyap import config
-    from marlyap.game import AbstractGame
 
     opened = Run.open(run, config.load(own, AbstractGame))
     saved = opened.checkpoints.latest()
@@ -519,9 +508,15 @@ def test_nan_from_a_users_task_is_named_and_the_last_checkpoint_is_intact(
     assert all(jnp.isfinite(x).all() for x in leaves if isinstance(x, jax.Array))
 
     before = contents(run)
-    again = refused(capsys, "train", "--resume", run, "--task", own, parts=["(seed 3)"])
+    again = refused(capsys, "train", "--resume", run, "--task", own, parts=["(seed 0)"])
     assert f"in iteration {at} " in again
     assert contents(run) == before
+
+
+@known_bug("what the warm-up plays is not looked at, so the first loss is blamed")
+def test_nan_in_the_warm_up_is_blamed_on_the_task(own, capsys):
+    command = ["train", own, "masac", "--out", "out", *TINY, "--task.edge", "0.6"]
+    refused(capsys, *command, "--seeds", "3", parts=["the task returned a number"])
 
 
 def test_nan_in_what_a_task_observes_is_named_in_the_first_iteration(own, tmp_path, capsys):
@@ -627,7 +622,7 @@ def test_list_of_one_in_a_process():
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     found = strict(done.stdout)
     assert found["--algorithm.constraint.reading"]["value"] == "han"
-    assert all(row["meaning"] for row in found.values())
+    assert found["--algorithm.batch"] == {"value": "256", "meaning": "transitions per update"}
 
 
 def test_demo_goes_on_with_what_is_there_and_prints_one_object(run, capsys):
@@ -643,7 +638,8 @@ def test_demo_goes_on_with_what_is_there_and_prints_one_object(run, capsys):
 
 
 @pytest.mark.slow
-def test_two_seeds_train_in_two_processes(tmp_path, capsys):
+def test_two_seeds_train_in_two_processes(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
     command = ["train", "rendezvous", "masac", "--out", "out", "--seeds", "4", "7", *TINY]
     code, out, _ = call(capsys, *command, "--parallel", "process", "--json")
     assert code == 0
@@ -654,8 +650,15 @@ def test_two_seeds_train_in_two_processes(tmp_path, capsys):
 
 
 @known_bug("workers._spawn does not pass --task and --algorithm on")
-def test_two_seeds_of_ones_own_task(own, tmp_path, capsys):
+def test_code_of_ones_own_reaches_the_processes(own, tmp_path, capsys, monkeypatch):
+    class Started(Exception):
+        pass
+
+    def start(command, **_):
+        raise Started(command)
+
+    monkeypatch.setattr(subprocess, "Popen", start)
     command = ["train", own, "masac", "--out", "out", "--seeds", "0", "1", *TINY]
-    code, out, err = call(capsys, *command, "--json")
-    assert code == 0, err
-    assert all(r["finished"] for r in strict(out)["runs"])
+    with pytest.raises(Started) as started:
+        main([*command, "--parallel", "process"])
+    assert own in started.value.args[0]

@@ -48,9 +48,6 @@ FLOORS = """
     config
     run
     fit
-    film
-    workers
-    commands
     workers
     film
     commands
@@ -134,11 +131,11 @@ import marlyap.store as s
 from marlyap import graph as graphs, errors
 from marlyap.types import Key
 def later():
-    from . import evaluate
+    from . import evaluation
     from .algorithms.masac import MASAC
     import os.path
 """
-    found = imported(ROOT / "train.py", ast.parse(source))
+    found = imported(ROOT / "trainer.py", ast.parse(source))
     assert found == {
         "marlyap.store", "marlyap.graph", "marlyap.errors", "marlyap.types",
         "marlyap.evaluation", "marlyap.algorithms.masac", "os.path",

@@ -54,7 +54,7 @@ class Lyapunov(AbstractConstraint):
     target: Literal["rollout", "hold_last", "bootstrap", "discounted"] = "rollout"
     discount: float = 0.95  # of the target `discounted`
     decrease: float = 0.1  # L must fall by this share of the cost
-    weight: float | None = 1.0  # of Delta L in J_pi; None: learnt, in [floor, 1]
+    weight: float | None = None  # of Delta L in J_pi; None: learnt, in [floor, 1]
     weight_start: float = 1.0  # the learnt weight to begin with
     floor: float = 1e-3  # smallest learnt weight
     ball: float = 0.0  # the constraint holds only where the team's cost exceeds this (m)
