@@ -29,6 +29,7 @@ VARIANTS = {
 }
 GAMES = VARIANTS | {f"TASKS[{k}]": g for k, g in TASKS.items() if g not in VARIANTS.values()}
 every_game = pytest.mark.parametrize("game", GAMES.values(), ids=GAMES)
+pytestmark = pytest.mark.usefixtures("quick_compilation")
 traces = Counter()
 
 

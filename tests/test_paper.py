@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from conftest import close, filled, same
+from conftest import close, filled, level, same
 from scipy import stats
 
 from marlyap.constraint import Unconstrained
@@ -22,6 +22,7 @@ from marlyap.nets import MLP, Actors, Critic, Greedy, LyapunovNet, NormNet, Samp
 from marlyap.rollout import Decentralised, cost_to_go, rollout
 
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
 KEY = jax.random.key(5)
 
 
@@ -210,13 +211,15 @@ def soft_target(algorithm, l, b, nxt):
 
 
 @pytest.fixture(scope="module", params=["team", "agent"])
-def with_heads(request, masac, learner, shape):
+def with_heads(request, masac, learner, batch, shape):
     """The algorithm with one value for the team, and with one for each agent."""
     if request.param == "team":
         return masac, learner
     n = shape.agents
     critic = lambda seed: filled(lambda k: Critic(shape, 8, n, True, key=k), KEY, seed=seed)
-    several = eqx.tree_at(lambda l: (l.Q.value, l.Q_bar), learner, (critic(7), critic(8)))
+    now = level(critic(7), batch.features, batch.action)
+    slow = level(critic(8), batch.next_features, batch.action)
+    several = eqx.tree_at(lambda l: (l.Q.value, l.Q_bar), learner, (now, slow))
     return replace(masac, heads="agent", keep_Q=True), several
 
 
@@ -724,7 +727,7 @@ def test_what_does_not_fit_together_is_refused():
 @pytest.mark.parametrize("normalise", [False, True])
 def test_L_is_a_sum_of_squares(shape, batch, normalise):
     L = filled(lambda k: LyapunovNet(shape, normalise, key=k), KEY, seed=6)
-    got = eqx.filter_jit(jax.vmap(L))(batch.features, batch.action)
+    got = jax.jit(jax.vmap(lambda f, a: L(f, a)))(batch.features, batch.action)
     want = [lyapunov(L, b.features, b.action) for b in rows(batch)]
     np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
     assert np.all(np.asarray(got) >= 0) and np.max(got) > 0
@@ -735,7 +738,7 @@ def test_L_is_a_sum_of_squares(shape, batch, normalise):
 def test_V_is_zero_exactly_on_the_target_set(shape, batch, normalise):
     """t10: whatever the weights, and whatever the features that are no errors."""
     V = filled(lambda k: NormNet(shape, normalise, key=k), KEY, seed=9)
-    value = eqx.filter_jit(jax.vmap(V))
+    value = jax.jit(jax.vmap(lambda f, a=None: V(f, a)))
     there = batch.features.at[:, :, : shape.errors].set(0)
     np.testing.assert_array_equal(value(there, batch.action), np.zeros(16))
     want = [norm_like(V, b.features) for b in rows(batch)]
@@ -748,7 +751,7 @@ def test_V_is_zero_exactly_on_the_target_set(shape, batch, normalise):
     for agent in range(shape.agents):  # one small error of one agent is enough
         for k in range(shape.errors):
             assert np.all(np.asarray(value(there.at[:, agent, k].set(1e-5), batch.action)) > 0)
-    slope = eqx.filter_jit(jax.vmap(jax.grad(V)))(there)
+    slope = jax.jit(jax.vmap(jax.grad(lambda f: V(f))))(there)
     assert np.isfinite(slope).all()
 
 
@@ -758,7 +761,7 @@ def lipschitz_quotients(V, shape):
         -3, 1, (400, 1, 1)
     )
     b = a + rng.standard_normal(a.shape) * 10 ** rng.uniform(-3, 1, (400, 1, 1))
-    value = eqx.filter_jit(jax.vmap(V))
+    value = jax.jit(jax.vmap(lambda f, a=None: V(f, a)))
     gap = np.abs(value(jnp.asarray(a, jnp.float32)) - value(jnp.asarray(b, jnp.float32)))
     return gap / np.linalg.norm((a - b)[:, :, : shape.errors].reshape(400, -1), axis=1)
 
@@ -880,8 +883,8 @@ def test_layout_of_seeds_that_see_the_same_without_a_batch(shape, batch, seeds):
 def test_layout_of_a_batch_of_noise_for_one_observation(learner, batch):
     """Only some of the inputs are batched."""
     pi, noise = learner.pi.value, xs(4, 3, 2)
-    sample = jax.vmap(pi.sample, in_axes=(None, 0, None))
-    got = eqx.filter_jit(sample)(batch.obs[0], noise, batch.action[0])
+    sample = jax.vmap(lambda o, z, a: pi.sample(o, z, a), in_axes=(None, 0, None))
+    got = jax.jit(sample)(batch.obs[0], noise, batch.action[0])
     for k in range(4):
         want = act(pi, np.asarray(batch.obs[0], float), np.asarray(noise[k], float))
         np.testing.assert_allclose(got.action[k], want[0], atol=1e-5)
