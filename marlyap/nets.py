@@ -36,7 +36,7 @@ class Layer(eqx.Module):
         self.bias = draw(k_bias, (size_out,)) / size_in**0.5
         self.norm = (jnp.ones(size_out), jnp.zeros(size_out)) if normalise else None
 
-    def __call__(self, x: Float[Array, "*stack in batch"]) -> Float[Array, "*stack out batch"]:
+    def __call__(self, x: Float[Array, "*stack in batch"]) -> Float[Array, "*nets out batch"]:
         if self.norm is None:
             return matmul(self.weight, x) + self.bias[..., None]
         # The mean over outputs that LayerNorm subtracts is linear in W and b: take it there.
@@ -63,7 +63,7 @@ class MLP(eqx.Module):
         return _apply(self, x[:, None])[:, 0]
 
 
-def _forward(net: MLP, x: Float[Array, "*stack in batch"]) -> Float[Array, "*stack out batch"]:
+def _forward(net: MLP, x: Float[Array, "*stack in batch"]) -> Float[Array, "*nets out batch"]:
     for layer in net.layers[:-1]:
         x = jax.nn.relu(layer(x))
     return net.layers[-1](x)
