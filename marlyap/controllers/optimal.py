@@ -74,7 +74,7 @@ def plan(game: AbstractGame, states: State) -> Plans:
 def _solver(problem: OptimalControl):
     """A function from the start and the goal of one agent to its inputs, time by du."""
     try:
-        import casadi
+        import casadi  # pyright: ignore[reportMissingImports] -- an extra
     except ImportError:
         raise UserError(
             "controller: optimal-control needs casadi; install it with "
