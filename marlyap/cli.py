@@ -63,12 +63,15 @@ def parser() -> Parser:
     p = verb("train", "train a team, one run for each seed", OVERRIDES)
     p.add_argument("task", nargs="?", metavar="TASK", help="a name of `marlyap list`")
     p.add_argument("algorithm", nargs="?", metavar="ALGORITHM", help="a name of `marlyap list`")
-    p.add_argument("--seeds", nargs="+", default=["0"], help="training seeds (default 0)")
-    p.add_argument("--steps", type=int, default=None, help="environment steps of each seed")
+    p.add_argument("--seeds", nargs="+", help="training seeds (default 0)")
+    p.add_argument("--steps", type=int, help="environment steps of each seed")
     p.add_argument("--out", type=Path, default=None, help="directory (default runs/TASK/ALGORITHM)")
-    p.add_argument("--preset", default="tuned", help="tuned (default) or paper")
+    p.add_argument("--preset", help="tuned (default) or paper")
     p.add_argument("--force", action="store_true", help="overwrite runs that are there")
     p.add_argument("--resume", type=Path, nargs="+", metavar="RUN", help="go on with these runs")
+    own = "where a resumed run's is your own code"
+    p.add_argument("--task", dest="own_task", help=f"the task, {own}")
+    p.add_argument("--algorithm", dest="own_algorithm", help=f"the algorithm, {own}")
     p.add_argument("--parallel", default="auto", help="seeds: auto, process (one a core) or vmap")
     p.add_argument("--device", default=None, help="cpu or gpu (default: what JAX finds)")
     p.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
@@ -132,6 +135,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             parser().print_help()
             return 0
         prepare(args)
+        if getattr(args, "device", None):
+            find_device(args.device)
         from marlyap import commands
 
         result, code = commands.VERBS[args.verb](args, overrides)
@@ -173,6 +178,8 @@ def prepare(args: Any) -> None:
     device = getattr(args, "device", None)
     if device not in (None, "cpu", "gpu"):
         raise UserError(f"device: '{device}' must be cpu or gpu.")
+    if getattr(args, "parallel", "auto") not in ("auto", "process", "vmap"):
+        raise UserError(f"parallel: '{args.parallel}' must be auto, process or vmap.")
     if device:
         os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": "cuda"}[device]
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_directory()))
@@ -181,6 +188,19 @@ def prepare(args: Any) -> None:
     core = os.environ.get("MARLYAP_CORE")
     if core and core.isdigit() and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {int(core)})
+
+
+def find_device(device: str) -> None:
+    """Raise UserError where JAX does not see the device that was asked for."""
+    import jax
+
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError):  # JAX asserts where the platform has no plugin
+        raise UserError(
+            f"device: JAX finds no {device} here; leave out --device, or install JAX for it, as "
+            "in pip install 'jax[cuda13]'."
+        ) from None
 
 
 def cache_directory() -> Path:

@@ -39,10 +39,12 @@ DEMO_STEPS = 204_800
 def train(args: Namespace, overrides: Overrides) -> Result:
     """Make the runs, or open those to be resumed, and train them."""
     if args.resume:
-        if args.task or args.algorithm:
-            game, algorithm = own_code(args, overrides)
-        else:
-            game = algorithm = None
+        given = {"--seeds": args.seeds, "--steps": args.steps, "--preset": args.preset}
+        given |= {"--out": args.out, "--force": args.force or None}
+        for option in [k for k, v in given.items() if v is not None]:
+            raise UserError(f"{option}: a run that is resumed goes on as it is; leave it out.")
+        args.task, args.algorithm = args.task or args.own_task, args.algorithm or args.own_algorithm
+        game, algorithm = own_code(args, overrides)
         runs = [Run.open(d, game, algorithm) for d in expand(args.resume)]
     else:
         if not args.task or not args.algorithm:
@@ -59,25 +61,24 @@ def train(args: Namespace, overrides: Overrides) -> Result:
 
 def create(args: Namespace, overrides: Overrides) -> list[Run]:
     """One new run for each seed."""
-    game, algorithm, trainer = assemble(args, overrides)
-    names = {"task": args.task, "algorithm": args.algorithm, "preset": args.preset}
+    trainer = assemble(args, overrides)
+    names = {"task": args.task, "algorithm": args.algorithm, "preset": args.preset or "tuned"}
     safe = lambda name: Path(name.rpartition(":")[2]).stem if ":" in name else name
     out = args.out or Path("runs") / safe(args.task) / safe(args.algorithm)
-    places = [(out / f"seed{seed}", seed) for seed in seeds(args.seeds)]
-    return [Run.create(place, trainer, seed, names, args.force) for place, seed in places]
+    places = {seed: out / f"seed{seed}" for seed in seeds(args.seeds or ["0"])}
+    for place in places.values():
+        Run.vacant(place, args.force)
+    return [Run.create(p, trainer, seed, names, args.force) for seed, p in places.items()]
 
 
-def assemble(
-    args: Namespace, overrides: Overrides
-) -> tuple[AbstractGame, AbstractAlgorithm, Trainer]:
+def assemble(args: Namespace, overrides: Overrides) -> Trainer:
     """Task, algorithm and schedule as asked for."""
-    if args.preset not in PRESETS:
-        raise UserError(
-            f"preset: '{args.preset}' is unknown; {config.suggest(args.preset, PRESETS)}"
-        )
+    preset = args.preset or "tuned"
+    if preset not in PRESETS:
+        raise UserError(f"preset: '{preset}' is unknown; {config.suggest(preset, PRESETS)}")
     game = config.load(args.task, AbstractGame)
-    algorithm = PRESETS[args.preset](config.load(args.algorithm, AbstractAlgorithm))
-    schedule = SCHEDULES[args.preset]
+    algorithm = PRESETS[preset](config.load(args.algorithm, AbstractAlgorithm))
+    schedule = SCHEDULES[preset]
     parts = {"task": game, "algorithm": algorithm, "schedule": schedule}
     for path, text in overrides.items():
         part, _, field = path.partition(".")
@@ -87,11 +88,7 @@ def assemble(
             raise UserError(f"--{part}.{error}") from None
     if args.steps is not None:
         parts["schedule"] = config.override(parts["schedule"], "steps", str(args.steps))
-    return (
-        parts["task"],
-        parts["algorithm"],
-        Trainer(parts["task"], parts["algorithm"], parts["schedule"]),
-    )
+    return Trainer(parts["task"], parts["algorithm"], parts["schedule"])
 
 
 def own_code(
@@ -127,27 +124,22 @@ def measure(args: Namespace, overrides: Overrides) -> Result:
         raise UserError(f"confidence: {args.confidence} must lie between 0 and 1.")
     game, algorithm = own_code(args, overrides)
     found: list[tuple[str, str, Any, Evaluation]] = []
+    directories = []
     for word in args.runs:
         if word in CONTROLLERS:
             if game is None:
                 raise UserError(f"task: {word} needs --task, the task it is to be measured on.")
-            found.append(
-                (
-                    word,
-                    word,
-                    None,
-                    evaluate(game, CONTROLLERS[word](game), args.episodes, args.seed),
-                )
-            )
-            continue
-        if not Path(word).exists():
-            raise UserError(
-                f"run: there is no run or controller '{word}'; {config.suggest(word, CONTROLLERS)}"
-            )
-        for directory in expand([Path(word)]):
-            run = Run.open(directory, game, algorithm)
-            result = evaluate(run.game, run.controller(), args.episodes, args.seed)
-            found.append((str(directory), group(run), run, result))
+            result = evaluate(game, CONTROLLERS[word](game), args.episodes, args.seed)
+            found.append((word, word, None, result))
+        elif Path(word).exists():
+            directories.append(Path(word))
+        else:
+            hint = config.suggest(word, CONTROLLERS)
+            raise UserError(f"run: there is no run or controller '{word}'; {hint}")
+    for directory in expand(directories):
+        run = Run.open(directory, game, algorithm)
+        result = evaluate(run.game, run.controller(), args.episodes, args.seed)
+        found.append((str(directory), group(run), run, result))
     rows = [
         {"name": name, "group": g, "seed": run.seed if run else None} | e.summary(args.confidence)
         for name, g, run, e in found
@@ -318,7 +310,7 @@ def watch(args: Namespace, overrides: Overrides) -> Result:
 def listing(args: Namespace, overrides: Overrides) -> Result:
     """What there is, or the fields of one of them."""
     if args.name:
-        return fields_of(args.name), 0
+        return fields_of(args.name, args.json), 0
     families: dict[str, dict[str, Any]] = {
         "tasks": TASKS,
         "algorithms": ALGORITHMS,
@@ -354,7 +346,7 @@ def summary(thing: Any) -> str:
     return line
 
 
-def fields_of(name: str) -> dict[str, Any]:
+def fields_of(name: str, quiet: bool) -> dict[str, Any]:
     """Every field of a task or algorithm with its value, for overriding."""
     family = AbstractGame if name in TASKS else AbstractAlgorithm
     if name not in TASKS and name not in ALGORITHMS:
@@ -368,7 +360,7 @@ def fields_of(name: str) -> dict[str, Any]:
         table.add_column(head)
     for option, value, note in rows:
         table.add_row(f"--{option}", value, note)
-    if not sys.argv[1:].count("--json"):
+    if not quiet:
         Console().print(table)
     return {f"--{option}": {"value": value, "meaning": note} for option, value, note in rows}
 
@@ -380,10 +372,10 @@ def demo(args: Namespace, overrides: Overrides) -> Result:
     job = Namespace(
         task="rendezvous",
         algorithm="masac-lyapunov",
-        preset="tuned",
+        preset=None,
         seeds=args.seeds,
         out=args.out,
-        steps=args.steps or DEMO_STEPS,
+        steps=DEMO_STEPS if args.steps is None else args.steps,
         force=args.again,
         parallel="auto",
         json=False,

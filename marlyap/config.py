@@ -9,6 +9,7 @@ import difflib
 import hashlib
 import importlib.util
 import inspect
+import sys
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -109,6 +110,9 @@ def build(data: Any, allowed: Mapping[str, type], where: str) -> Any:
         field = f"{where}.{name}"
         if isinstance(value, dict):
             values[name] = build(value, allowed, field)
+            kinds = tuple(k for k in _alternatives(hints[name]) if isinstance(k, type))
+            if not isinstance(values[name], kinds):
+                raise UserError(f"{field}: {value['kind']} is not {_expected(hints[name])}.")
         else:
             values[name] = _convert(
                 tuple(value) if isinstance(value, list) else value, hints[name], field
@@ -143,7 +147,8 @@ def _override(obj: T, path: list[str], text: str, full: str) -> T:
         value = _override(have[name], rest, text, full)
     else:
         value = _parse(text, _hints(type(obj))[name], full)
-    return _construct(type(obj), have | {name: value}, "")
+    parents = full.split(".")[: -len(path)]
+    return _construct(type(obj), have | {name: value}, ".".join(parents))
 
 
 def _construct(cls: type[T], values: dict[str, Any], where: str) -> T:
@@ -151,8 +156,8 @@ def _construct(cls: type[T], values: dict[str, Any], where: str) -> T:
         return cls(**values)
     except UserError as error:
         raise UserError(f"{where}.{error}" if where and ":" not in where else str(error)) from None
-    except TypeError as error:
-        raise UserError(f"{where or cls.__name__}: {error}.") from None
+    except Exception as error:  # whatever the constructor of a user's class may raise
+        raise UserError(f"{where or cls.__name__}: {error}.") from error
 
 
 def _parse(text: str, hint: Any, where: str) -> Any:
@@ -200,11 +205,15 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
             return value
         if origin is tuple and isinstance(value, tuple):
             return tuple(_convert(v, typing.get_args(kind)[0], where) for v in value)
-        if kind is float and type(value) in (int, float):
+        if kind is float and (type(value) is float or _is_int64(value)):
             return float(value)
         if isinstance(kind, type) and type(value) is kind:
             return value
     raise UserError(f"{where}: {value!r} is not {_expected(hint)}.")
+
+
+def _is_int64(value: Any) -> bool:
+    return type(value) is int and abs(value) < 2**63
 
 
 def _alternatives(hint: Any) -> list[Any]:
@@ -251,10 +260,11 @@ def _module(path: Path, word: str) -> types.ModuleType:
     if spec is None or spec.loader is None:
         raise UserError(f"{word}: {path} is not a Python file.")
     module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # where typing and inspect look for it
     try:
         spec.loader.exec_module(module)
     except UserError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise UserError(f"{word}: {path} could not be loaded: {error}.") from error
     return module

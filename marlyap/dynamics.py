@@ -32,11 +32,11 @@ class AbstractDynamics(eqx.Module):
     def __check_init__(self):
         if len(self.limits) != len(self.inputs) or not all(0 < u < 1e6 for u in self.limits):
             raise UserError(
-                f"dynamics.limits: {self.limits} must be {len(self.inputs)} positive numbers, "
+                f"limits: {self.limits} must be {len(self.inputs)} positive numbers, "
                 f"the largest {' and '.join(self.inputs)}."
             )
         if self.integrator not in ("euler", "rk4"):
-            raise UserError(f"dynamics.integrator: '{self.integrator}' must be euler or rk4.")
+            raise UserError(f"integrator: '{self.integrator}' must be euler or rk4.")
 
     @property
     def dx(self) -> int:

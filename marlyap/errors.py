@@ -6,3 +6,12 @@ class UserError(Exception):
 
     The command line prints it on standard error and exits with code 2, without a traceback.
     """
+
+
+def within(
+    name: str, value: float | int, low: float | int, high: float | int, open: bool = False
+) -> None:
+    """Raise UserError unless low <= value <= high; `open` leaves `low` itself out."""
+    if not (low < value if open else low <= value) or not value <= high:
+        least = f"more than {low:g}" if open else f"{low:g}"
+        raise UserError(f"{name}: {value} is out of range; take {least} to {high:g}.")

@@ -22,13 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from marlyap import config, store
+from marlyap import config, seeds, store
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.nets import LyapunovNet, NormNet
 from marlyap.rollout import Decentralised, Policy
-from marlyap.seeds import stream
 from marlyap.trainer import Carry, Schedule, Trainer, shape
 
 
@@ -55,15 +54,10 @@ class Run:
         force: bool = False,
     ) -> "Run":
         """A new run directory. Raises UserError if it exists, unless `force` empties it."""
-        if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-            if not force:
-                raise UserError(
-                    f"out: {directory} already exists; choose another directory, go on with it by "
-                    f"--resume {directory}, or overwrite it with --force."
-                )
-            if not (directory / "run.json").is_file():
-                raise UserError(f"out: {directory} is not a run; --force would destroy it.")
-            shutil.rmtree(directory)
+        cls.vacant(directory, force)
+        if directory.exists():
+            with store.lock(directory):  # not while another process trains in it
+                shutil.rmtree(directory)
         about = {
             "schema": SCHEMA,
             "task": config.record(trainer.game),
@@ -80,6 +74,22 @@ class Run:
             raise UserError(f"out: {directory} cannot be made ({error.strerror}).") from None
         store.write_text_atomic(directory / "run.json", json.dumps(about, indent=1) + "\n")
         return cls(directory, trainer, seed, names)
+
+    @staticmethod
+    def vacant(directory: Path, force: bool = False) -> None:
+        """Raise UserError unless a run can be made here (with `force`, in place of another)."""
+        try:
+            if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):
+                return
+        except OSError as error:
+            raise UserError(f"out: {directory} cannot be made ({error.strerror}).") from None
+        if not force:
+            raise UserError(
+                f"out: {directory} already exists; choose another directory, go on with it by "
+                f"--resume {directory}, or overwrite it with --force."
+            )
+        if not (directory / "run.json").is_file():
+            raise UserError(f"out: {directory} is not a run; --force would destroy it.")
 
     @classmethod
     def open(
@@ -105,6 +115,7 @@ class Run:
             )
         if type(about["seed"]) is not int or not isinstance(about["names"], dict):
             raise UserError(f"run: {where} has a seed or names of the wrong kind.")
+        seeds.check(about["seed"])
         own = {type(o).__name__: type(o) for o in (game, algorithm) if o is not None}
         parts = [
             config.build(about[part], config.known() | own, part)
@@ -187,8 +198,15 @@ class Run:
 
 
 def begin(trainer: Trainer, seed: int) -> Carry:
-    """The state of a fresh run."""
-    return _begin(trainer, stream(seed, "train"))
+    """The state of a fresh run. Raises UserError if the warm-up was not played in numbers."""
+    carry = _begin(trainer, seeds.stream(seed, "train"))
+    for name in ("obs", "features", "reward", "cost"):
+        if not bool(jnp.all(jnp.isfinite(getattr(carry.memory.episodes, name)))):
+            raise UserError(
+                f"{name}: the task returned a number that is not finite in the warm-up "
+                f"(seed {seed}); mend the task."
+            )
+    return carry
 
 
 @eqx.filter_jit

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
 from marlyap.algorithm import AbstractAlgorithm
-from marlyap.errors import UserError
+from marlyap.errors import within
 from marlyap.evaluation import outcomes
 from marlyap.game import AbstractGame
 from marlyap.nets import Shape
@@ -46,11 +46,10 @@ class Schedule(eqx.Module):
             ("judge_every", 1, 10**9),
             ("judge_episodes", 1, 10**6),
         ):
-            if not low <= getattr(self, name) <= high:
-                value = getattr(self, name)
-                raise UserError(f"{name}: {value} is out of range; take {low} to {high}.")
-        if not 0 < self.decay <= 1:
-            raise UserError(f"decay: {self.decay} must lie in (0, 1].")
+            within(name, getattr(self, name), low, high)
+        within("decay", self.decay, 0, 1, open=True)
+        if self.decay_episodes is not None:
+            within("decay_episodes", self.decay_episodes, 1, 10**12)
 
 
 class Carry(eqx.Module):

@@ -58,8 +58,6 @@ def train_all(runs: list[Run], args: Namespace) -> int:
     runs = [run for run in runs if not run.finished]
     if not runs:
         return 0
-    if args.parallel not in ("auto", "process", "vmap"):
-        raise UserError(f"parallel: '{args.parallel}' must be auto, process or vmap.")
     vmapped = args.parallel == "vmap" or (
         args.parallel == "auto" and jax.default_backend() != "cpu"
     )
@@ -70,7 +68,7 @@ def train_all(runs: list[Run], args: Namespace) -> int:
         elif len(runs) == 1 or (vmapped and _alike(runs)):
             _show(fit(runs, stop), runs)
         else:
-            _show(_processes(runs, stop), runs)
+            _show(_processes(runs, stop, args), runs)
     if stop.signal:
         where = " ".join(str(run.directory) for run in runs)
         print(f"Saved. Go on with: marlyap train --resume {where}", file=sys.stderr)
@@ -115,7 +113,7 @@ def _show(events: Iterable[dict[str, Any]], runs: list[Run]) -> None:
                 console.print(f"seed {e['seed']}: {text}", highlight=False)
 
 
-def _processes(runs: list[Run], stop: Stop) -> Iterator[dict[str, Any]]:
+def _processes(runs: list[Run], stop: Stop, args: Namespace) -> Iterator[dict[str, Any]]:
     """One process a core; each prints its events as JSON lines."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
     waiting, free, queue = list(runs), list(cores), Queue()
@@ -123,7 +121,7 @@ def _processes(runs: list[Run], stop: Stop) -> Iterator[dict[str, Any]]:
     while (waiting and not stop()) or active:
         while waiting and free and not stop():
             run, core = waiting.pop(0), free.pop(0)
-            child = _spawn(run, core)
+            child = _spawn(run, core, args)
             stop.children.append(child)
             active[child.pid] = (child, core, run)
             threading.Thread(target=_listen, args=(child, queue), daemon=True).start()
@@ -142,8 +140,10 @@ def _processes(runs: list[Run], stop: Stop) -> Iterator[dict[str, Any]]:
             raise UserError(said.splitlines()[-1] if said else f"{run.directory}: training failed.")
 
 
-def _spawn(run: Run, core: int) -> subprocess.Popen:
-    command = [sys.executable, "-m", "marlyap", "train", "--worker", "--resume", str(run.directory)]
+def _spawn(run: Run, core: int, args: Namespace) -> subprocess.Popen:
+    names = [args.task, args.algorithm] if ":" in f"{args.task}{args.algorithm}" else []
+    command = [sys.executable, "-m", "marlyap", "train", *names]
+    command += ["--worker", "--resume", str(run.directory)]
     return subprocess.Popen(
         command,
         env=os.environ | {"MARLYAP_CORE": str(core), "MARLYAP_WORKER": "1"},

@@ -27,6 +27,7 @@ from jaxtyping import PyTree
 
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.constraint import AbstractConstraint, Unconstrained
+from marlyap.errors import within
 from marlyap.learn import Learnt, polyak
 from marlyap.nets import Actors, Critic, Greedy, Sample, Sampled
 from marlyap.types import Scalar, Transition
@@ -62,6 +63,16 @@ class MASAC(AbstractAlgorithm):
     average: float = 1e-3  # how fast the policy handed out follows the actor; 1 is the actor itself
     keep_Q: bool = True  # False drops Q from the policy objective (Han et al. 2020)
     constraint: AbstractConstraint = Unconstrained()
+
+    def __check_init__(self):
+        for name in ("gamma", "tau", "average"):
+            within(name, getattr(self, name), 0, 1, open=name != "gamma")
+        for name in ("rate_pi", "rate_Q", "rate_alpha"):
+            within(name, getattr(self, name), 0, 1)
+        for name in ("alpha", "reward_scale"):
+            within(name, getattr(self, name), 0, 1e6, open=True)
+        for name in ("batch", "n_step", "actor_width", "critic_width"):
+            within(name, getattr(self, name), 1, 1_000_000)
 
     @property
     def foresight(self):

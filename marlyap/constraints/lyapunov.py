@@ -19,6 +19,8 @@ actions in the memory, so what is meant has to be read into it:
              memory did make L fall: imitate what worked (Theorem 1 holds for any tuple)
     score    raise the likelihood of actions after which the state function L fell, and lower it of
              those after which it rose, with a clipped ratio (as in proximal policy optimisation)
+    critic   L(s, a) itself, with a from the current policy: no Lyapunov condition at all, but the
+             same sum of the next T costs; the control that tells what the condition adds to it
 """
 
 from typing import Literal
@@ -29,7 +31,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from marlyap.constraint import AbstractConstraint
-from marlyap.errors import UserError
+from marlyap.errors import UserError, within
 from marlyap.learn import Learnt, polyak
 from marlyap.nets import LyapunovNet, NormNet, Sample
 from marlyap.types import Action, Scalar, Transition
@@ -48,7 +50,7 @@ class Certificate(eqx.Module):
 class Lyapunov(AbstractConstraint):
     """Algorithm 2's term `weight * Delta L` in J_pi, with L learnt beside it."""
 
-    reading: Literal["han", "literal", "hinge", "score"] = "han"
+    reading: Literal["han", "literal", "hinge", "score", "critic"] = "han"
     function: Literal["squares", "norm"] = "squares"  # L(s, a) sum of squares, or V(s) norm-like
     horizon: int = 10  # T of L_target, in steps
     target: Literal["rollout", "hold_last", "bootstrap", "discounted"] = "rollout"
@@ -67,19 +69,23 @@ class Lyapunov(AbstractConstraint):
     tau: float = 0.005  # how fast the slow copy of L follows
 
     def __check_init__(self):
-        if self.function == "norm" and self.reading == "han":
+        if self.function == "norm" and self.reading in ("han", "critic"):
             raise UserError(
-                "constraint.function: 'norm' is a function of the state alone, which gives the "
-                "reading 'han' no gradient; take reading score or hinge, or function squares."
+                "function: 'norm' is a function of the state alone, which gives the reading "
+                f"'{self.reading}' no gradient; take reading score or hinge, or function squares."
             )
         if self.function == "squares" and self.reading == "score":
-            raise UserError("constraint.reading: 'score' needs constraint.function norm.")
+            raise UserError("reading: 'score' needs function norm.")
         if self.function == "squares" and self.slope == "spectral":
-            raise UserError("constraint.slope: 'spectral' needs constraint.function norm.")
-        if not 1 <= self.horizon <= 10_000:
-            raise UserError(f"constraint.horizon: {self.horizon} steps is out of range 1 to 10000.")
-        if self.weight is not None and not 0 <= self.weight < 1e6:
-            raise UserError(f"constraint.weight: {self.weight} must not be negative.")
+            raise UserError("slope: 'spectral' needs function norm.")
+        within("horizon", self.horizon, 1, 10_000)
+        for name in ("discount", "decrease", "tau"):
+            within(name, getattr(self, name), 0, 1, open=name == "tau")
+        for name in ("weight_start", "floor", "input_gain"):
+            within(name, getattr(self, name), 0, 1e6, open=True)
+        for name in ("ball", "clip", "rate_L", "rate_weight", "weight", "slope"):
+            if isinstance(value := getattr(self, name), float | int):
+                within(name, value, 0, 1e6)
 
     @property
     def foresight(self):
@@ -106,6 +112,8 @@ class Lyapunov(AbstractConstraint):
             rise = jax.lax.stop_gradient(self.rise(L, b, nxt.action))
             bound = jax.nn.relu(rise + self.lipschitz(L) * moved)
             term = jnp.where(rise <= 0, bound, 0.0)
+        elif self.reading == "critic":
+            term = net(b.features, now.action)
         else:
             fall = net(b.features, b.action) - net(b.next_features, b.action)
             advantage = (fall - self.decrease * jnp.mean(b.cost)) / jnp.sqrt(L.scale)
