@@ -10,15 +10,9 @@ import itertools
 import sys
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-
-from marlyap.controllers import CONTROLLERS, Cascade, Replayed, plan
+from marlyap.controllers import CONTROLLERS, Cascade, OptimalControl
 from marlyap.dynamics import Unicycle
-from marlyap.evaluation import RADII, evaluate, outcome, share
-from marlyap.rollout import rollout
-from marlyap.seeds import stream
+from marlyap.evaluation import RADII, evaluate, share
 from marlyap.tasks.rendezvous import Rendezvous
 
 
@@ -47,14 +41,6 @@ SETTINGS = [
 COLUMNS = "controller agents graph leaders limit horizon radius episodes successes rate low high"
 
 
-def optimal(game, episodes):
-    """Final distances under optimal control, where everyone knows the target."""
-    states = jax.vmap(game.reset)(jax.random.split(stream(SEED, "evaluate"), episodes))
-    key = jax.random.key(SEED)
-    judge = lambda a, s: outcome(game, rollout(game, Replayed(a), s, key)).final
-    return np.asarray(jax.jit(jax.vmap(judge))(jnp.asarray(plan(game, states)), states))
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="two settings, 200 episodes, printed")
@@ -68,7 +54,7 @@ def main():
             controller = CONTROLLERS[name.split(",")[0]](game, **gains)
             final[name] = evaluate(game, controller, 200 if quick else 4000, SEED).final
         if (n, graph, leaders, horizon) == (3, "complete", 1, 40) and not quick:
-            final["optimal-control"] = optimal(game, 50)
+            final["optimal-control"] = evaluate(game, OptimalControl(game), 50, SEED).final
         for name, radius in itertools.product(final, RADII):
             s = share(final[name] <= radius, 0.95)
             counts = (s["episodes"], s["successes"], s["success_rate"])

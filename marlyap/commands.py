@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -186,35 +187,28 @@ def tabulate(
     rows: list[dict[str, Any]], groups: list[dict[str, Any]], pairs: list[dict[str, Any]]
 ) -> None:
     """The evaluation as a table on standard output."""
-    table = Table(
-        title=f"success within {rows[0]['radius']} m at the last step", title_justify="left"
-    )
-    for head in (
-        "run",
-        "episodes",
-        "success",
-        "interval",
-        "r=0.05",
-        "median m",
-        "95 % m",
-        "settled s",
-        "return",
-    ):
-        table.add_column(head, justify="left" if head == "run" else "right", no_wrap=head != "run")
+    first, counts = rows[0], {row["episodes"] for row in rows}
+    title = f"{counts.pop()} fresh starts" if len(counts) == 1 else "fresh starts"
+    title += f"; success: all within {first['radius']:g} m at the last step"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1))
+    table.add_column("run", overflow="fold")
+    percent = f"{100 * first['confidence']:g} %"
+    heads = "success", percent, "at 0.05 m", "median m", "95 % m", "settled s", "return"
+    for head in heads:
+        table.add_column(head, justify="right", no_wrap=True)
+    number = lambda v, digits: "-" if v is None else f"{v:.{digits}f}"
     several = len(rows) > len(groups)
     for row in rows + (groups if several else []):
         low, high = row["interval"]
-        number = lambda v, digits: "-" if v is None else f"{v:.{digits}f}"
         table.add_row(
             row.get("name") or f"all of {row['group']}",
-            str(row["episodes"]),
             f"{100 * row['success_rate']:.1f} %",
-            f"{100 * low:.1f}-{100 * high:.1f} %",
+            f"{100 * low:.1f}-{100 * high:.1f}",
             f"{100 * row['radii'][0]['success_rate']:.1f} %",
             number(row["final_distance"]["0.5"], 3),
             number(row["final_distance"]["0.95"], 3),
             number(row["settling_time"]["0.5"], 1),
-            f"{row['return_mean']:.2f}",
+            f"{row['return_mean']:.1f}",
         )
     console = Console()
     console.print(table)

@@ -11,10 +11,10 @@ from jaxtyping import Array, Bool, Float
 
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
-from marlyap.rollout import Controller, rollout
+from marlyap.rollout import AbstractPlanner, Controller, rollout
 from marlyap.seeds import Purpose, stream
 from marlyap.statistics import clopper_pearson, mcnemar
-from marlyap.types import Key, Keys, Scalar, Trajectory
+from marlyap.types import Key, Keys, Scalar, State, Trajectory
 
 
 RADII = (0.05, 0.1, 0.15, 0.2, 0.3)  # m, for the success curve
@@ -60,6 +60,18 @@ def outcomes(game: AbstractGame, controller: Controller, keys: Keys) -> Outcome:
     return jax.vmap(lambda k: outcome(game, episode(game, controller, k)))(keys)
 
 
+@eqx.filter_jit
+def _outcomes_of_each(game: AbstractGame, controllers: Controller, keys: Keys) -> Outcome:
+    """The same with a controller for every key."""
+    one = lambda controller, k: outcome(game, episode(game, controller, k))
+    return eqx.filter_vmap(one)(controllers, keys)
+
+
+def starts(game: AbstractGame, keys: Keys) -> State:
+    """Where the episodes of these keys begin."""
+    return jax.vmap(lambda k: game.reset(jax.random.split(k)[0]))(keys)
+
+
 class Evaluation(eqx.Module):
     """The outcomes of many episodes of one controller, as NumPy arrays of length `episodes`."""
 
@@ -94,7 +106,7 @@ class Evaluation(eqx.Module):
 
 def evaluate(
     game: AbstractGame,
-    controller: Controller,
+    controller: Controller | AbstractPlanner,
     episodes: int = 500,
     seed: int = 0,
     purpose: Purpose = "evaluate",
@@ -106,7 +118,10 @@ def evaluate(
     if not 1 <= episodes <= 10_000_000:
         raise UserError(f"episodes: {episodes} is out of range; take 1 to 10000000.")
     keys = jax.random.split(stream(seed, purpose), episodes)
-    out = outcomes(game, controller, keys)
+    if isinstance(controller, AbstractPlanner):
+        out = _outcomes_of_each(game, controller.plan(starts(game, keys)), keys)
+    else:
+        out = outcomes(game, controller, keys)
     return Evaluation(**{k: np.asarray(v) for k, v in vars(out).items()}, radius=game.radius)
 
 

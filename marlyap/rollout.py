@@ -53,6 +53,14 @@ class Decentralised(eqx.Module):
         return self.policy(self.game.observe(state), key)
 
 
+class AbstractPlanner(eqx.Module):
+    """Decides the whole episode when it sees the start; cannot run inside jit."""
+
+    @abc.abstractmethod
+    def plan(self, states: State) -> Controller:
+        """A controller for each start (leaves of both have a leading axis `episode`)."""
+
+
 def rollout(
     game: AbstractGame, controller: Controller, start: State, key: Key, steps: int | None = None
 ) -> Trajectory:

@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap.controllers import CONTROLLERS, OptimalControl, PointOffset, Replayed, plan
+from marlyap.controllers import CONTROLLERS, OptimalControl, PointOffset, Replayed
 from marlyap.dynamics import DoubleIntegrator, Unicycle
 from marlyap.errors import UserError
+from marlyap.evaluation import evaluate
 from marlyap.rollout import rollout
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State
@@ -149,14 +150,14 @@ def test_a_plan_is_replayed_by_the_clock():
 
 
 def test_optimal_control_asks_for_a_plan():
-    with pytest.raises(UserError, match="Replayed"):
+    with pytest.raises(UserError, match="plans before the episode"):
         OptimalControl(PATH)(PATH.reset(KEY), KEY)
 
 
 def test_without_casadi_the_mend_is_said(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "casadi", None)
     with pytest.raises(UserError, match=r"marlyap\[optimal-control\]"):
-        plan(PATH, batch([PATH.reset(KEY)]))
+        OptimalControl(PATH).plan(batch([PATH.reset(KEY)]))
 
 
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
@@ -164,9 +165,16 @@ def test_optimal_plans_end_at_rest_on_the_goal(integrator):
     pytest.importorskip("casadi")
     game = Rendezvous(agents=2, horizon=20, dynamics=Unicycle(integrator=integrator))
     states = batch([game.reset(KEY)])
-    actions = plan(game, states)
+    actions = OptimalControl(game).plan(states).actions
     assert actions.shape == (1, 20, 2, 2) and np.abs(actions).max() <= 1
     state = game.reset(KEY)
     for action in actions[0]:
         state = step(game, state, jnp.asarray(action))
     assert (game.distance(state) < 0.01).all() and jnp.abs(state.x[:, 3:]).max() < 1e-3
+
+
+def test_optimal_control_is_evaluated_like_the_others():
+    pytest.importorskip("casadi")
+    game = Rendezvous(agents=2, horizon=20)
+    result = evaluate(game, OptimalControl(game), 3)
+    assert result.successes.all() and (result.final < 0.01).all()

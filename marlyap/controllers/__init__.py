@@ -4,11 +4,7 @@ from marlyap.controllers.cascade import Cascade as Cascade
 from marlyap.controllers.controller import AbstractController as AbstractController
 from marlyap.controllers.gradient import GradientConsensus as GradientConsensus
 from marlyap.controllers.lin_francis_maggiore import LinFrancisMaggiore as LinFrancisMaggiore
-from marlyap.controllers.optimal import (
-    OptimalControl as OptimalControl,
-    Replayed as Replayed,
-    plan as plan,
-)
+from marlyap.controllers.optimal import OptimalControl as OptimalControl, Replayed as Replayed
 from marlyap.controllers.point_offset import PointOffset as PointOffset
 from marlyap.controllers.pursuit import TreePursuit as TreePursuit
 
@@ -18,5 +14,5 @@ CONTROLLERS: dict[str, type[AbstractController]] = {
     "gradient-consensus": GradientConsensus,
     "lin-francis-maggiore": LinFrancisMaggiore,
     "tree-pursuit": TreePursuit,
-    "optimal-control": OptimalControl,  # plans ahead: see its file
+    "optimal-control": OptimalControl,
 }

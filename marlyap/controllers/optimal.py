@@ -17,22 +17,20 @@ from jaxtyping import Array, Float
 from marlyap.controllers.controller import AbstractController
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
+from marlyap.rollout import AbstractPlanner
 from marlyap.types import Action, Key, State
-
-
-Plans = Float[np.ndarray, "episode time agent du"]
 
 
 class Replayed(eqx.Module):
     """Open loop: the action at step t is row t, and the last row once the plan has ended."""
 
-    actions: Float[Array, "time agent du"]
+    actions: Float[Array, "*episode time agent du"]  # the axis `episode` in a batch of plans
 
     def __call__(self, state: State, key: Key) -> Action:
         return self.actions[jnp.clip(state.t, 0, self.actions.shape[0] - 1)]
 
 
-class OptimalControl(AbstractController):
+class OptimalControl(AbstractPlanner, AbstractController):
     """Each agent minimises miss |p_T - p*|^2 + effort sum |u|^2, ending at rest at the horizon T.
 
     Every agent knows its goal, so this bounds from above what a decentralised law can reach. The
@@ -46,12 +44,12 @@ class OptimalControl(AbstractController):
 
     def __call__(self, state, key):
         raise UserError(
-            "controller: OptimalControl plans before the episode; replay "
-            "OptimalControl(game).plan(states) with Replayed."
+            "controller: optimal-control plans before the episode, so it can be evaluated alone; "
+            "choose another controller."
         )
 
-    def plan(self, states: State) -> Plans:
-        """Actions for a batch of starts (leaves with a leading axis episode).
+    def plan(self, states: State) -> Replayed:
+        """Open-loop inputs for a batch of starts (leaves with a leading axis episode).
 
         Raises UserError when casadi is missing. An agent whose two problems both fail is sent
         with the better of ipopt's last iterates.
@@ -63,12 +61,7 @@ class OptimalControl(AbstractController):
             for team, targets in zip(starts, goals, strict=True)
         ]
         actions = np.asarray(each, np.float32) / np.asarray(self.game.dynamics.limits, np.float32)
-        return np.clip(np.moveaxis(actions, 1, 2), -1.0, 1.0)
-
-
-def plan(game: AbstractGame, states: State) -> Plans:
-    """The plans of `OptimalControl` with its default weights."""
-    return OptimalControl(game).plan(states)
+        return Replayed(jnp.asarray(np.clip(np.moveaxis(actions, 1, 2), -1.0, 1.0)))
 
 
 def _solver(problem: OptimalControl):
