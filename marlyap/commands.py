@@ -16,7 +16,7 @@ from rich.table import Table
 
 from marlyap import config, film, store
 from marlyap.algorithm import AbstractAlgorithm
-from marlyap.algorithms import ALGORITHMS, MASAC, PRESETS
+from marlyap.algorithms import ALGORITHMS, PRESETS
 from marlyap.certificates import CERTIFICATES
 from marlyap.certify import certify, save
 from marlyap.controllers import CONTROLLERS
@@ -190,10 +190,10 @@ def tabulate(
     first, counts = rows[0], {row["episodes"] for row in rows}
     title = f"{counts.pop()} fresh starts" if len(counts) == 1 else "fresh starts"
     title += f"; success: all within {first['radius']:g} m at the last step"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1))
-    table.add_column("run", overflow="fold")
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("run", overflow="fold", min_width=16)
     percent = f"{100 * first['confidence']:g} %"
-    heads = "success", percent, "at 0.05 m", "median m", "95 % m", "settled s", "return"
+    heads = "success", percent, "in 0.05", "median", "95 %", "settled"
     for head in heads:
         table.add_column(head, justify="right", no_wrap=True)
     number = lambda v, digits: "-" if v is None else f"{v:.{digits}f}"
@@ -208,10 +208,10 @@ def tabulate(
             number(row["final_distance"]["0.5"], 3),
             number(row["final_distance"]["0.95"], 3),
             number(row["settling_time"]["0.5"], 1),
-            f"{row['return_mean']:.1f}",
         )
     console = Console()
     console.print(table)
+    console.print("median and 95 %: worst final distance (m); settled: median time (s)\n")
     for pair in pairs:
         text = f"{pair['a']} against {pair['b']}: only the first {pair['only_a']}, "
         text += f"only the second {pair['only_b']}, McNemar p = {pair['p_value']:.2g}"
@@ -335,9 +335,20 @@ def summary(thing: Any) -> str:
         limits = " and ".join(f"{u:g}" for u in thing.dynamics.limits)
         several = "s" * (who > 1)
         line += f" ({n} agents, {who} leader{several}, {thing.graph} graph, limits {limits})"
-    elif isinstance(thing, MASAC):
-        line += f" Constraint: {config.show(thing.constraint)}."
+    elif isinstance(thing, AbstractAlgorithm) and (set_here := changes(thing)):
+        line += f" ({', '.join(set_here)})"
     return line
+
+
+def changes(thing: Any, prefix: str = "") -> list[str]:
+    """The fields, nested ones too, that are not what their class has by default."""
+    usual, found = config.fields(type(thing)()), []
+    for name, value in config.fields(thing).items():
+        if config.show(value) != config.show(usual[name]):
+            found.append(f"{prefix}{name} {config.show(value)}")
+        if dataclasses.is_dataclass(value):
+            found += changes(value, f"{prefix}{name}.")
+    return found
 
 
 def fields_of(name: str, quiet: bool) -> dict[str, Any]:

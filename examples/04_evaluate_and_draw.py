@@ -1,0 +1,26 @@
+"""Open a run, evaluate it, and draw: paths as PNG, an episode as GIF, all of it as one HTML page.
+
+Make the run first: marlyap train rendezvous masac-lyapunov --out runs/mine
+"""
+
+import sys
+from pathlib import Path
+
+from marlyap import Run, draw, evaluate, film, report
+
+
+def main(directory: Path, out: Path) -> dict:
+    run = Run.open(directory)
+    result = evaluate(run.game, run.controller(), episodes=500)
+    print(f"success {100 * result.success_rate:.1f} %, at the radii {result.summary()['radii']}")
+
+    page = film.page([run], episodes=500, seed=0, command="examples/04_evaluate_and_draw.py")
+    (out / "report.html").write_text(report.html(page))
+    draw.trajectories_png(page["films"], out / "starts.png")
+    draw.film_gif(film.one(run, episode=0, seed=0), out / "film.gif")
+    print(f"Drawn: {out}/report.html, starts.png, film.gif")
+    return page["summary"]
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2] if len(sys.argv) > 2 else "."))
