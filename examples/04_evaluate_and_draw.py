@@ -12,12 +12,13 @@ from marlyap import Run, draw, evaluate, film, report
 def main(directory: Path, out: Path) -> dict:
     run = Run.open(directory)
     result = evaluate(run.game, run.controller(), episodes=500)
-    print(f"success {100 * result.success_rate:.1f} %, at the radii {result.summary()['radii']}")
+    for row in result.summary()["radii"]:
+        print(f"within {row['radius']} m: {100 * row['success_rate']:.1f} %")
 
     page = film.page([run], episodes=500, seed=0, command="examples/04_evaluate_and_draw.py")
     (out / "report.html").write_text(report.html(page))
     draw.trajectories_png(page["films"], out / "starts.png")
-    draw.film_gif(film.one(run, episode=0, seed=0), out / "film.gif")
+    draw.film_gif(film.one(run, 0, seed=0), out / "film.gif")
     print(f"Drawn: {out}/report.html, starts.png, film.gif")
     return page["summary"]
 
