@@ -98,6 +98,10 @@ def parser() -> Parser:
     p = verb("recheck", "derive every figure of a certificate again, without JAX")
     p.add_argument("certificate", type=Path, metavar="CERTIFICATE", help="what certify wrote")
 
+    p = verb("check-task", "hold a task against the laws that all else relies on", OVERRIDES)
+    p.add_argument("task", metavar="TASK", help="a name of `marlyap list`, or path/to/file.py:Name")
+    p.add_argument("--seed", type=int, default=0, help="of the episodes looked at (default 0)")
+
     p = verb("report", "write one HTML file (and PNGs) about runs")
     p.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run directories")
     p.add_argument("--out", type=Path, default=None, help="HTML file (default in the first run)")

@@ -12,6 +12,7 @@ from typing import Any, cast
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from marlyap import config, film, store
@@ -19,6 +20,7 @@ from marlyap.algorithm import AbstractAlgorithm
 from marlyap.algorithms import ALGORITHMS, PRESETS
 from marlyap.certificates import CERTIFICATES
 from marlyap.certify import certify, save
+from marlyap.conformance import conformance
 from marlyap.controllers import CONTROLLERS
 from marlyap.errors import UserError
 from marlyap.evaluation import Evaluation, compare, evaluate, pooled
@@ -265,6 +267,24 @@ def recheck_certificate(args: Namespace, overrides: Overrides) -> Result:
     return result, 0
 
 
+def check_task(args: Namespace, overrides: Overrides) -> Result:
+    """`check-task`: one finding for every law; exit code 1 if one is broken."""
+    game, _ = own_code(Namespace(task=args.task, algorithm=None), overrides)
+    assert game is not None
+    found = conformance(game, args.seed)
+    if not args.json:
+        table = Table(title=args.task, title_justify="left", show_header=False)
+        for f in found:
+            mark = "not looked at" if f.faults is None else "broken" if f.faults else "kept"
+            figures = ", ".join(f"{name} {value:.3g}" for name, value in f.figures.items())
+            text = "\n".join(f.faults or ()) or f.says + (f" ({figures})" if figures else "")
+            table.add_row(f.law, mark, escape(text))
+        Console().print(table)
+    broken = any(f.faults for f in found)
+    laws = {f.law: {"says": f.says, "faults": f.faults, "figures": f.figures} for f in found}
+    return {"task": args.task, "passes": not broken, "laws": laws}, int(broken)
+
+
 def report(args: Namespace, overrides: Overrides) -> Result:
     """Write the HTML page and the pictures."""
     game, algorithm = own_code(args, overrides)
@@ -425,6 +445,7 @@ VERBS: dict[str, Callable[[Namespace, Overrides], Result]] = {
     "evaluate": measure,
     "certify": certification,
     "recheck": recheck_certificate,
+    "check-task": check_task,
     "report": report,
     "watch": watch,
     "list": listing,

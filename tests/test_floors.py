@@ -40,6 +40,7 @@ FLOORS = """
     evaluation
     trainer
     lyapunov_function
+    conformance
     certificate
     certificates
     certify

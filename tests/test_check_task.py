@@ -1,0 +1,458 @@
+"""Every broken task is caught, and its fault named."""
+
+import itertools
+import json
+import re
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from marlyap.cli import main
+from marlyap.conformance import LAWS, conformance, shapes
+from marlyap.dynamics import SingleIntegrator
+from marlyap.tasks import Rendezvous
+from marlyap.types import State
+
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+
+class Sound(Rendezvous):
+    """A task as small as they come, in which agents 0 and 2 do not see each other."""
+
+    agents: int = 3
+    graph: str = "path"
+    horizon: int = 4
+    dynamics: SingleIntegrator = SingleIntegrator()
+
+
+BROKEN = {}  # the class, the law it breaks, and what the fault must say
+
+
+def breaks(law, says):
+    def note(cls):
+        BROKEN[cls] = (law, says)
+        return cls
+
+    return note
+
+
+count = itertools.count()
+
+
+@breaks("shapes", "reset: it returns a tuple; return State")
+class StartIsNoState(Sound):
+    def reset(self, key):
+        return super().reset(key).x, jnp.zeros(2)
+
+
+@breaks("shapes", "reset: it raised KeyError")
+class StartRaises(Sound):
+    def reset(self, key):
+        return {}["start"]
+
+
+@breaks("shapes", r"reset: x: it is float32\[3\]; return floating\[3, 2\]")
+class StartIsFlat(Sound):
+    def reset(self, key):
+        start = super().reset(key)
+        return eqx.tree_at(lambda s: s.x, start, start.x[:, 0])
+
+
+@breaks("shapes", r"reset: t: it is float32\[\]; return integer\[\]")
+class TimeIsAFloat(Sound):
+    def reset(self, key):
+        return eqx.tree_at(lambda s: s.t, super().reset(key), jnp.zeros(()))
+
+
+@breaks("shapes", r"observe: it is float32\[2, \d+\]; return floating\[3, any\]")
+class OneAgentSeesNothing(Sound):
+    def observe(self, state):
+        return super().observe(state)[1:]
+
+
+@breaks("shapes", "observe: it is int32.*return float32")
+class WholeNumbersAreSeen(Sound):
+    def observe(self, state):
+        return super().observe(state).astype(int)
+
+
+@breaks("shapes", r"costs: it is float32\[\]; return floating\[3\]")
+class OneCostForAll(Sound):
+    def costs(self, state, action):
+        return jnp.mean(super().costs(state, action))
+
+
+@breaks("shapes", "terminated: it is float32.*; return bool")
+class EndIsANumber(Sound):
+    def terminated(self, state):
+        return jnp.zeros(())
+
+
+@breaks("shapes", "step: t becomes float32.* from int32")
+class StepChangesAType(Sound):
+    def step(self, state, action):
+        return eqx.tree_at(lambda s: s.t, super().step(state, action), state.t + 1.0)
+
+
+@breaks("shapes", "step: it returns another kind of state than reset")
+class StepAddsMemory(Sound):
+    def step(self, state, action):
+        after = super().step(state, action)
+        return State(x=after.x, goal=after.goal, t=after.t, memory=action)
+
+
+@breaks("shapes", "costs: it raised TracerBoolConversionError.*use jnp.where")
+class CostHasAnIf(Sound):
+    def costs(self, state, action):
+        cost = super().costs(state, action)
+        return cost if cost[0] > 0.1 else 0 * cost
+
+
+@breaks("finite", r"rewards: a number is not finite in \d+ of 64 states")
+class RewardIsALogarithm(Sound):
+    def rewards(self, state, action):
+        return -jnp.log(super().costs(state, action) - 1)
+
+
+@breaks("finite", "costs: a number is not finite in 64 of 64 states, first at step 0")
+class CostIsInfinite(Sound):
+    def costs(self, state, action):
+        return super().costs(state, action) / 0
+
+
+@breaks("deterministic", "step: it said two things of one state")
+class StepHasItsOwnChance(Sound):
+    def step(self, state, action):
+        return super().step(state, action + 0.01 * np.random.standard_normal())
+
+
+@breaks("deterministic", "reset: the same key gave two different starts")
+class StartHasItsOwnChance(Sound):
+    def reset(self, key):
+        return super().reset(jax.random.fold_in(key, next(count)))
+
+
+@breaks("deterministic", "step: the same key gave two different episodes")
+class ChanceBehindTheCompiler(Sound):
+    def step(self, state, action):
+        after = super().step(state, action)
+        late = jax.ShapeDtypeStruct((), jnp.float32)
+        noise = jax.pure_callback(
+            lambda t: np.float32(next(count)), late, state.t, vmap_method="sequential"
+        )
+        return eqx.tree_at(lambda s: s.x, after, after.x + 1e-3 * noise * (state.t == 3))
+
+
+@breaks("compiled", "costs: compiled and uncompiled it differs")
+class CostKnowsItIsTraced(Sound):
+    def costs(self, state, action):
+        return super().costs(state, action) * (1.0 if jax.config.jax_disable_jit else 2.0)
+
+
+@jax.custom_batching.custom_vmap
+def alone(x):
+    return x
+
+
+@alone.def_vmap
+def _(size, batched, x):
+    return x - jnp.mean(x, axis=0, keepdims=True), batched[0]
+
+
+@breaks("batched", "observe: under jax.vmap it differs")
+class ViewOfTheWholeBatch(Sound):
+    def observe(self, state):
+        return alone(super().observe(state))
+
+
+@breaks("traced_once", "fields: an equal task is compiled again")
+class FieldIsAFunction(Sound):
+    bonus: object = eqx.field(init=False)
+
+    def __post_init__(self):
+        self.bonus = lambda x: x  # a new one each time
+
+
+@breaks("traced_once", "fields: they do not make it anew")
+class ConstructorTakesSomethingElse(Sound):
+    def __init__(self, sizes=(1.0, 1.0)):
+        self.size = sizes[0]
+
+
+@breaks("resets", "reset: different keys gave the same start")
+class AlwaysTheSameStart(Sound):
+    def reset(self, key):
+        return super().reset(jax.random.key(0))
+
+
+@breaks("resets", "reset: an episode starts at t = 1")
+class StartsLate(Sound):
+    def reset(self, key):
+        start = super().reset(key)
+        return eqx.tree_at(lambda s: s.t, start, start.t + 1)
+
+
+LEAK = []
+
+
+@breaks("resets", "reset: it depends on steps taken before")
+class EpisodesLeak(Sound):
+    def reset(self, key):
+        start = super().reset(key)
+        return eqx.tree_at(lambda s: s.x, start, start.x + 0.1 * len(LEAK))
+
+    def step(self, state, action):
+        LEAK.append(1)
+        return super().step(state, action)
+
+
+@breaks("clock", "step: t does not grow by 1")
+class TimeStandsStill(Sound):
+    def step(self, state, action):
+        return eqx.tree_at(lambda s: s.t, super().step(state, action), state.t)
+
+
+@breaks("clock", "step: the goal moves within an episode")
+class GoalMoves(Sound):
+    def step(self, state, action):
+        return eqx.tree_at(lambda s: s.goal, super().step(state, action), state.goal + 0.01)
+
+
+@breaks("local", "observe: a row changes with agent [02], which is not its neighbour")
+class EverybodySeesEverybody(Sound):
+    def observe(self, state):
+        return jnp.concatenate(
+            [super().observe(state), jnp.broadcast_to(state.x[:, 0], (3, 3))], axis=1
+        )
+
+
+@breaks("local", "observe: a row changes with the goal of agent 1, which is not theirs to see")
+class FollowersSeeTheirGoal(Sound):
+    def observe(self, state):
+        return jnp.concatenate([super().observe(state), state.goal - state.x], axis=1)
+
+
+@breaks("bounded_inputs", "step: an action of 4 does more than one of 1")
+class UnboundedActions(Sound):
+    def step(self, state, action):
+        return State(x=state.x + self.dt * action, goal=state.goal, t=state.t + 1)
+
+
+@breaks("target", "success: it is false with every agent on its goal")
+class NeverSucceeds(Sound):
+    def success(self, state):
+        return jnp.asarray(False)
+
+
+@breaks("target", "success: it holds in every state that was met")
+class AlwaysSucceeds(Sound):
+    def success(self, state):
+        return jnp.asarray(True)
+
+
+@breaks("target", "errors: they are not 0 with every agent at rest on its goal")
+class ErrorsFromTheOrigin(Sound):
+    def errors(self, state):
+        return state.x
+
+
+@breaks("target", "errors: they are 0 beside the goal too")
+class ErrorsOfOneAxis(Sound):
+    def errors(self, state):
+        return (state.x - state.goal) * jnp.array([[1.0, 0.0]])
+
+
+@breaks("target", "step: without an action agents at rest move by 0.01")
+class Wind(Sound):
+    def step(self, state, action):
+        after = super().step(state, action)
+        return eqx.tree_at(lambda s: s.x, after, after.x + 0.01)
+
+
+@breaks("costs", r"costs: one is -\d.*; let none be negative")
+class NegativeCost(Sound):
+    def costs(self, state, action):
+        return super().costs(state, action) * state.x[:, 0]
+
+
+@breaks("costs", "costs: they are 0.5 on the target set")
+class CostOfLiving(Sound):
+    def costs(self, state, action):
+        return super().costs(state, action) + 0.5
+
+
+@breaks("costs", "costs: they are 0 wherever the agents went")
+class NoCost(Sound):
+    def costs(self, state, action):
+        return 0 * super().costs(state, action)
+
+
+@breaks("costs", "cost: it is not the mean of costs")
+class CostIsTheSum(Sound):
+    def cost(self, state, action):
+        return jnp.sum(self.costs(state, action))
+
+
+@breaks("rewards", "rewards: they rise with the cost")
+class RewardHasTheWrongSign(Sound):
+    def rewards(self, state, action):
+        return self.costs(state, action)
+
+
+@breaks("rewards", "rewards: they are the same in every state")
+class NoReward(Sound):
+    def rewards(self, state, action):
+        return 0 * self.costs(state, action)
+
+
+@breaks("smooth_cost", r"costs: .* the slope grows from .* \(Assumption 1\)")
+class CostJumps(Sound):
+    def costs(self, state, action):
+        cost = super().costs(state, action)
+        return cost + (cost > 0.5)
+
+
+@breaks("smooth_cost", r"costs: .* the slope grows from .* \(Assumption 1\)")
+class CostIsARoot(Sound):
+    def costs(self, state, action):
+        return jnp.sqrt(super().costs(state, action))
+
+
+@breaks("smooth_step", r"step: .* the slope grows from .* \(Assumption 2\)")
+class WorldIsATorus(Sound):
+    def step(self, state, action):
+        after = super().step(state, action)
+        return eqx.tree_at(lambda s: s.x, after, (after.x + 1) % 2 - 1)
+
+
+@breaks("time_limit", "terminated: it is true because the time is over")
+class TheHorizonTerminates(Sound):
+    def terminated(self, state):
+        return state.t >= self.horizon
+
+
+@breaks("time_limit", "terminated: every game is over after one step")
+class OverAtOnce(Sound):
+    def terminated(self, state):
+        return jnp.asarray(True)
+
+
+@breaks("time_limit", "step: nothing moves after the horizon")
+class FrozenAtTheHorizon(Sound):
+    def step(self, state, action):
+        after = super().step(state, action)
+        x = jnp.where(state.t < self.horizon, after.x, state.x)
+        return eqx.tree_at(lambda s: s.x, after, x)
+
+
+CHANCE = {"compiled", "batched", "bounded_inputs", "target", "smooth_step"}
+ALSO = {  # other laws that the same mistake may break
+    CostIsInfinite: {"costs", "rewards", "smooth_cost"},
+    StepHasItsOwnChance: CHANCE,
+    ChanceBehindTheCompiler: CHANCE,
+    StartHasItsOwnChance: {"resets"},
+    ViewOfTheWholeBatch: {"compiled", "local"},
+    NoCost: {"rewards"},
+    WorldIsATorus: {"bounded_inputs"},
+}
+SLOW = {"deterministic", "compiled", "batched", "resets"}  # they also look uncompiled
+
+
+def faults(found):
+    return {finding.law: finding.faults for finding in found if finding.faults}
+
+
+@pytest.mark.parametrize("cls", BROKEN, ids=lambda cls: cls.__name__)
+def test_a_broken_task_is_caught_and_its_fault_named(cls, recwarn):
+    law, says = BROKEN[cls]
+    laws = [l for l in LAWS if l.__name__ == law or l.__name__ not in SLOW]
+    found = faults(conformance(cls(), laws=laws))
+    assert law in found, found
+    text = " / ".join(found[law])
+    assert re.search(says, text), text
+    assert found.keys() - {law} <= ALSO.get(cls, set()), found
+    for sentence in itertools.chain(*found.values()):
+        assert sentence.endswith(".") and ": " in sentence and "; " in sentence, sentence
+        assert "\n" not in sentence
+
+
+def test_every_law_is_broken_by_one_and_kept_by_a_sound_task():
+    assert len(BROKEN) >= 20
+    assert {law for law, _ in BROKEN.values()} == {law.__name__ for law in (shapes, *LAWS)}
+    found = conformance(Sound())
+    assert not faults(found) and all(f.faults == () for f in found)
+    assert [f.law for f in found] == ["shapes", *(law.__name__ for law in LAWS)]
+    assert all(f.says and not f.says.endswith(".") for f in found)
+
+
+def test_the_slopes_are_lipschitz_constants():
+    """Of distance to the goal it is 1 an agent, of a step of x' = u it is 1 in x and dt in u."""
+    found = {f.law: f.figures for f in conformance(Sound())}
+    assert 0.3 < found["smooth_cost"]["slope"] <= 3**-0.5 + 1e-3
+    assert 0.9 < found["smooth_step"]["slope"] <= (1 + 0.1**2) ** 0.5 + 1e-3
+    assert found["rewards"]["correlation"] == pytest.approx(-1)
+
+
+def test_after_wrong_shapes_nothing_else_is_looked_at():
+    first, *rest = conformance(OneCostForAll())
+    assert first.faults and all(finding.faults is None for finding in rest)
+
+
+def test_a_task_that_raises_when_it_runs_is_told_so():
+    class Late(Sound):
+        def distance(self, state):
+            return jax.pure_callback(
+                lambda x: 1 / 0,
+                jax.ShapeDtypeStruct((3,), jnp.float32),
+                state.x,
+                vmap_method="sequential",
+            )
+
+    found = conformance(Late())
+    assert "task: it raised" in found[0].faults[0]
+    assert all(finding.faults is None for finding in found[1:])
+
+
+FILE = """
+import jax.numpy as jnp
+from marlyap.dynamics import SingleIntegrator
+from marlyap.tasks import Rendezvous
+
+class Mine(Rendezvous):
+    horizon: int = 4
+    dynamics: SingleIntegrator = SingleIntegrator()
+
+class Bad(Mine):
+    def observe(self, state):
+        return state.x[:1]
+"""
+
+
+def test_the_command_line(tmp_path, capsys):
+    file = tmp_path / "mine.py"
+    file.write_text(FILE)
+    assert main(["check-task", f"{file}:Mine"]) == 0
+    out = capsys.readouterr().out
+    assert "smooth_cost" in out and "slope 0." in out
+
+    assert main(["check-task", f"{file}:Bad", "--json"]) == 1
+    said = json.loads(capsys.readouterr().out)
+    assert said["passes"] is False
+    assert said["laws"]["shapes"]["faults"] == [
+        "observe: it is float32[1, 2]; return floating[3, any]."
+    ]
+    assert said["laws"]["local"]["faults"] is None
+
+    assert main(["check-task", f"{file}:Bad"]) == 1
+    assert "observe: it is float32[1, 2]" in " ".join(capsys.readouterr().out.split())
+
+    assert main(["check-task", f"{file}:Missing"]) == 2
+    assert main(["check-task", str(Path("nowhere.py:Mine"))]) == 2
+    assert main(["check-task", "rendezvouz"]) == 2
+    assert "did you mean 'rendezvous'?" in capsys.readouterr().err
+    assert main(["check-task", f"{file}:Mine", "--task.graph", "ring", "--seed", "3"]) == 0
