@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from marlyap.layout import batch_last, matmul
+from marlyap.layout import batch_last, matmul, rows_as_columns
 from marlyap.rollout import AbstractExplorer
 from marlyap.types import Action, Features, Key, Obs, Scalar
 
@@ -70,6 +70,7 @@ def _forward(net: MLP, x: Float[Array, "*stack in batch"]) -> Float[Array, "*net
 
 
 _apply = batch_last(_forward)
+_apply_to_rows = batch_last(rows_as_columns(_forward))  # one net for every row of x
 
 
 class Sample(NamedTuple):
@@ -83,7 +84,8 @@ class Sample(NamedTuple):
 class Actors(eqx.Module):
     """pi_phi = {pi_phi_1, ..., pi_phi_N}: a Gaussian squashed by tanh for every agent.
 
-    Agent i's action is made of row i of the observations alone.
+    Agent i's action is made of row i of the observations alone. Shared weights serve any number
+    of agents.
     """
 
     net: MLP  # leaves have a leading axis `agent`, unless shared
@@ -99,19 +101,18 @@ class Actors(eqx.Module):
 
     def sample(self, obs: Obs, noise: Action, memory: Action) -> Sample:
         """tanh(mean + std * noise) for standard normal noise: reparametrised."""
-        per_agent = eqx.filter_vmap(_squashed, in_axes=(None if self.shared else 0, 0))
+        per_agent = _squashed_rows if self.shared else eqx.filter_vmap(_squashed)
         column = lambda x: x[..., None]
         out = per_agent(self.net, (column(obs), column(noise), column(memory)))
         return Sample(out[0][..., 0], out[1][..., 0, 0], out[2][..., 0, 0])
 
     def mode(self, obs: Obs) -> Action:
         """The deterministic policy that is evaluated, certified and deployed."""
-        per_agent = eqx.filter_vmap(lambda net, o: net(o), in_axes=(None if self.shared else 0, 0))
-        return jnp.tanh(jnp.split(per_agent(self.net, obs), 2, axis=-1)[0])
+        per_agent = _apply_to_rows if self.shared else eqx.filter_vmap(_apply)
+        return jnp.tanh(jnp.split(per_agent(self.net, obs[..., None])[..., 0], 2, axis=-1)[0])
 
 
-@batch_last
-def _squashed(net: MLP, x: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+def _squash(net: MLP, x: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
     """(obs, noise, memory) [*stack, ., batch] -> (action, log pi of it, log pi of memory)."""
     obs, noise, memory = x
     mean, log_std = jnp.split(_forward(net, obs), 2, axis=-2)
@@ -127,6 +128,10 @@ def _squashed(net: MLP, x: tuple[Array, Array, Array]) -> tuple[Array, Array, Ar
     return jnp.tanh(u), log_prob(u, noise), log_prob(past, (past - mean) * jnp.exp(-log_std))
 
 
+_squashed = batch_last(_squash)
+_squashed_rows = batch_last(rows_as_columns(_squash))
+
+
 class Sampled(AbstractExplorer):
     """The policy that explores."""
 
@@ -138,6 +143,22 @@ class Sampled(AbstractExplorer):
 
     def log_prob(self, obs: Obs, action: Action) -> Float[Array, "agent"]:
         return self.pi.sample(obs, action, action).log_prob_memory
+
+
+class Noisy(AbstractExplorer):
+    """The deterministic policy with Gaussian noise added, clipped to what can be done."""
+
+    pi: Actors
+    std: float
+
+    def __call__(self, obs: Obs, key: Key) -> Action:
+        mode = self.pi.mode(obs)
+        return jnp.clip(mode + self.std * jax.random.normal(key, mode.shape), -1.0, 1.0)
+
+    def log_prob(self, obs: Obs, action: Action) -> Float[Array, "agent"]:
+        """The density of the noise, as if it had not been clipped."""
+        noise = (action - self.pi.mode(obs)) / self.std
+        return jnp.sum(-0.5 * noise**2 - jnp.log(self.std) - 0.5 * jnp.log(2 * jnp.pi), axis=1)
 
 
 class Greedy(eqx.Module):
@@ -152,16 +173,42 @@ class Greedy(eqx.Module):
 class Critic(eqx.Module):
     """Q_theta^1 and Q_theta^2 of (s, a): central, twin; one value for the team or one an agent."""
 
-    nets: MLP  # leaves have a leading axis of 2
+    nets: MLP  # leaves have a leading axis `twin`
 
-    def __init__(self, shape: Shape, width: int, heads: int, normalise: bool, *, key: Key):
+    def __init__(
+        self, shape: Shape, width: int, heads: int, normalise: bool, twins: int = 2, *, key: Key
+    ):
         size = shape.agents * (shape.features + shape.du)
         make = lambda k: MLP((size, width, width, heads), normalise, key=k)
-        self.nets = eqx.filter_vmap(make)(jax.random.split(key, 2))
+        self.nets = eqx.filter_vmap(make)(jax.random.split(key, twins))
 
     def __call__(self, features: Features, action: Action) -> Float[Array, "twin head"]:
         x = jnp.concatenate([features.ravel(), action.ravel()])
         return eqx.filter_vmap(lambda net: net(x))(self.nets)
+
+
+class MeanFieldCritic(eqx.Module):
+    """Q of agent i's own state and action and the mean of the others' (Yang et al. 2018), twin.
+
+    One net for all agents: neither its weights nor an agent's share of the work grow with their
+    number, and to exchange two agents exchanges their values. The mean over agents is the team's.
+    """
+
+    nets: MLP  # leaves have a leading axis of 2
+    team: bool
+
+    def __init__(self, shape: Shape, width: int, team: bool, normalise: bool, *, key: Key):
+        size = 2 * (shape.features + shape.du)
+        make = lambda k: MLP((size, width, width, 1), normalise, key=k)
+        self.nets = eqx.filter_vmap(make)(jax.random.split(key, 2))
+        self.team = team
+
+    def __call__(self, features: Features, action: Action) -> Float[Array, "twin head"]:
+        own = jnp.concatenate([features, action], axis=1)
+        others = jnp.sum(own, axis=0, keepdims=True) - own
+        x = jnp.concatenate([own, others / max(own.shape[0] - 1, 1)], axis=1)
+        each = eqx.filter_vmap(lambda net: _apply_to_rows(net, x[..., None])[:, 0, 0])(self.nets)
+        return jnp.mean(each, axis=1, keepdims=True) if self.team else each
 
 
 class LyapunovNet(eqx.Module):

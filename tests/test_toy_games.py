@@ -4,8 +4,6 @@ The three games are one object that differs in a number, so that each algorithm 
 A new algorithm is one line in ALGORITHMS.
 """
 
-from collections.abc import Iterator
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,7 +11,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Int
 
-from marlyap.algorithms.masac import MASAC
+from marlyap.algorithms import MADDPG, MASAC, CentralisedSAC, DecentralisedSAC
 from marlyap.constraints.lyapunov import Lyapunov
 from marlyap.dynamics import AbstractDynamics, SingleIntegrator
 from marlyap.evaluation import outcomes
@@ -26,13 +24,23 @@ from marlyap.types import State
 GAMMA, SCALE = 0.8, 2.0
 QUICK = dict(
     gamma=GAMMA, reward_scale=SCALE, tau=0.05, average=0.05, rate_pi=2e-3, rate_Q=5e-3,
-    alpha=1e-3, rate_alpha=0.0, batch=64, actor_width=32, critic_width=32,
+    batch=64, actor_width=32, critic_width=32,
 )  # fmt: skip
+COLD = dict(alpha=1e-3, rate_alpha=0.0)
+NEAR = dict(horizon=2, weight=1.0, rate_L=1e-2)
 ALGORITHMS = {
-    "masac": MASAC(**QUICK, heads="team"),
+    "masac": MASAC(**QUICK, **COLD, heads="team"),
     "masac-lyapunov": MASAC(
-        **QUICK, heads="agent", n_step=2, constraint=Lyapunov(horizon=4, weight=0.3)
+        **QUICK, **COLD, heads="agent", n_step=2, constraint=Lyapunov(horizon=4, weight=0.3)
     ),
+    "lac": MASAC(**QUICK, **COLD, keep_Q=False, constraint=Lyapunov(**NEAR)),
+    "critic-only": MASAC(
+        **QUICK, **COLD, keep_Q=False, constraint=Lyapunov(reading="critic", **NEAR)
+    ),
+    "decentralised-sac": DecentralisedSAC(**QUICK, **COLD),
+    "centralised-sac": CentralisedSAC(**QUICK, **COLD),
+    "maddpg": MADDPG(**QUICK),
+    "matd3": MADDPG(**QUICK, critics=2, smoothing=0.2, delay=2),
 }
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 BANDIT, CONSTANT, REACH = range(3)
@@ -42,6 +50,7 @@ class Toy(AbstractGame):
     """Two agents, each with a goal of its own, that move as they wish.
 
     BANDIT: one step, reward 1 - |a - 0.4 o|^2. CONSTANT: reward 1 for ever. REACH: minus distance.
+    The cost is what the reward lacks of its best.
     """
 
     kind: Int[Array, ""]
@@ -65,70 +74,65 @@ class Toy(AbstractGame):
         return (self.kind == BANDIT) & (state.t >= 1)
 
     def costs(self, state, action):
-        return jnp.where(self.kind == REACH, self.distance(state), 0.0)
+        miss = jnp.sum((action - 0.4 * self.observe(state)) ** 2, axis=1)
+        bandit = jnp.where(self.kind == BANDIT, miss, 0.0)
+        return jnp.where(self.kind == REACH, self.distance(state), bandit)
 
     def rewards(self, state, action):
-        miss = jnp.sum((action - 0.4 * self.observe(state)) ** 2, axis=1)
-        bandit = jnp.where(self.kind == BANDIT, 1 - miss, 1.0)
-        return jnp.where(self.kind == REACH, -self.distance(state), bandit)
+        return jnp.where(self.kind == REACH, 0.0, 1.0) - self.costs(state, action)
 
 
 SCHEDULE = Schedule(
     steps=1600, environments=16, steps_per_update=1, warmup=480, capacity=100_000, decay=0.3
 )
-begin = eqx.filter_jit(lambda trainer, key: trainer.begin(key))
-iterate = eqx.filter_jit(lambda trainer, carry: trainer.iterate(carry))
+KINDS = jnp.arange(3)  # all three side by side: one program, compiled once
+KEYS = jax.random.split(jax.random.key(9), 200)
 
 
-def trained(algorithm, kind) -> Iterator:
-    """The learner after every iteration."""
-    trainer = Trainer(Toy(jnp.asarray(kind)), algorithm, SCHEDULE)
-    carry = begin(trainer, jax.random.key(0))
-    for _ in range(trainer.iterations):
-        carry, info = iterate(trainer, carry)
-        assert all(np.isfinite(v).all() for v in info.values())
-        yield carry.learner
+def each_game(f):
+    """f(trainer, what) for the three games at once; every result has a leading axis `kind`."""
+    trainer = lambda kind, algorithm: Trainer(Toy(kind), algorithm, SCHEDULE)
+    one = lambda kind, algorithm, what: f(trainer(kind, algorithm), what)
+    return eqx.filter_jit(eqx.filter_vmap(one, in_axes=(0, None, eqx.if_array(0))))
 
 
-@eqx.filter_jit
-def look(algorithm, learner, game, keys):
-    """Observations, the policy's actions there, and Q of them, at random starts."""
+begin = each_game(lambda trainer, key: trainer.begin(key))
+iterate = each_game(lambda trainer, carry: trainer.iterate(carry))
+
+
+@each_game
+def look(trainer, learner):
+    """Observations, the policy's actions there, Q of them, and the distance at the end."""
+    game, algorithm = trainer.game, trainer.algorithm
+    policy = algorithm.exploit(learner)
 
     def one(key):
         state = game.reset(key)
         obs = game.observe(state)
-        action = algorithm.exploit(learner)(obs, key)
+        action = policy(obs, key)
+        if isinstance(algorithm, DecentralisedSAC):  # a critic for each agent, of what it observes
+            each = eqx.filter_vmap(lambda Q, o, a: Q(o[None], a[None]))
+            return obs, action, jnp.mean(each(learner.Q.value, obs, action))
         return obs, action, jnp.mean(learner.Q.value(game.features(state), action))
 
-    return jax.vmap(one)(keys)
+    return *jax.vmap(one)(KEYS), outcomes(game, Decentralised(policy, game), KEYS).final
 
 
-KEYS = jax.random.split(jax.random.key(9), 200)
-every_algorithm = pytest.mark.parametrize("name", ALGORITHMS)
-
-
-@every_algorithm
-def test_one_step_game(name):
-    """The best action is 0.4 o, and is worth its reward: nothing comes after termination."""
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_algorithm_finds_the_answers(name):
     algorithm = ALGORITHMS[name]
-    *_, learner = trained(algorithm, BANDIT)
-    obs, action, Q = look(algorithm, learner, Toy(jnp.asarray(BANDIT)), KEYS)
-    assert np.mean(np.abs(action - 0.4 * obs)) < 0.08
-    assert np.mean(Q) == pytest.approx(SCALE, rel=0.1)
+    carry = begin(KINDS, algorithm, jax.random.split(jax.random.key(0), 3))
+    for _ in range(Trainer(Toy(KINDS[0]), algorithm, SCHEDULE).iterations):
+        carry, info = iterate(KINDS, algorithm, carry)
+        assert all(np.isfinite(v).all() for v in info.values())
+    obs, action, Q, final = look(KINDS, algorithm, carry.learner)
 
-
-@every_algorithm
-def test_constant_reward(name):
-    """Q = r / (1 - gamma): the time limit does not end the game."""
-    algorithm = ALGORITHMS[name]
-    *_, learner = trained(algorithm, CONSTANT)
-    _, _, Q = look(algorithm, learner, Toy(jnp.asarray(CONSTANT)), KEYS)
-    np.testing.assert_allclose(Q, SCALE / (1 - GAMMA), rtol=0.06)
-
-
-@every_algorithm
-def test_reach(name):
-    algorithm, game = ALGORITHMS[name], Toy(jnp.asarray(REACH))
-    *_, learner = trained(algorithm, REACH)
-    seen = outcomes(game, Decentralised(algorithm.exploit(learner), game), KEYS)
-    assert np.mean(np.asarray(seen.final) <= game.radius) > 0.9
+    # The best action is 0.4 o, and is worth its reward: nothing comes after termination.
+    # What learns from sums of costs alone also hears of later steps; no action misses by 0.27.
+    near = 0.08 if getattr(algorithm, "keep_Q", True) else 0.13
+    assert np.mean(np.abs(action - 0.4 * obs)[BANDIT]) < near
+    assert np.mean(Q[BANDIT]) == pytest.approx(SCALE, rel=0.1)
+    # Q = r / (1 - gamma): the time limit does not end the game.
+    np.testing.assert_allclose(Q[CONSTANT], SCALE / (1 - GAMMA), rtol=0.06)
+    # Everyone reaches its goal.
+    assert np.mean(final[REACH] <= Toy(KINDS[0]).radius) > 0.9

@@ -1,30 +1,34 @@
 """The algorithms that can be asked for by name, each in two settings.
 
-`tuned` is what learns best here; `paper` is section 4 of the paper to the letter.
+`tuned` is what learns best here; `paper` is section 4 of the paper to the letter, and for the
+references, which the paper does not have, the same networks and numbers.
 """
 
 import dataclasses
 
 from marlyap.algorithm import AbstractAlgorithm
+from marlyap.algorithms.maddpg import MADDPG as MADDPG
 from marlyap.algorithms.masac import MASAC as MASAC
+from marlyap.algorithms.sac import (
+    CentralisedSAC as CentralisedSAC,
+    DecentralisedSAC as DecentralisedSAC,
+)
 from marlyap.constraints import Lyapunov
+
+
+PLAIN = {"normalise": False, "heads": "team", "average": 1.0, "reward_scale": 1.0}
 
 
 def paper(algorithm: AbstractAlgorithm) -> AbstractAlgorithm:
     """Section 4: plain networks, one value for the team, the weight of Delta L learnt."""
+    if isinstance(algorithm, MADDPG):
+        return dataclasses.replace(algorithm, **PLAIN)
     if not isinstance(algorithm, MASAC):
         return algorithm
     constraint = algorithm.constraint
-    if isinstance(constraint, Lyapunov):
+    if isinstance(constraint, Lyapunov) and constraint.reading != "critic":
         constraint = dataclasses.replace(constraint, weight=None)
-    return dataclasses.replace(
-        algorithm,
-        normalise=False,
-        heads="team",
-        average=1.0,
-        reward_scale=1.0,
-        constraint=constraint,
-    )
+    return dataclasses.replace(algorithm, **PLAIN, constraint=constraint)
 
 
 PRESETS = {"tuned": lambda algorithm: algorithm, "paper": paper}
@@ -32,4 +36,12 @@ PRESETS = {"tuned": lambda algorithm: algorithm, "paper": paper}
 ALGORITHMS: dict[str, AbstractAlgorithm] = {
     "masac": MASAC(),
     "masac-lyapunov": MASAC(constraint=Lyapunov()),
+    "masac-nstep": MASAC(n_step=5),
+    # Han et al. 2020 for many agents, and what it owes to its critic alone.
+    "lac": MASAC(keep_Q=False, constraint=Lyapunov()),
+    "critic-only": MASAC(keep_Q=False, constraint=Lyapunov(reading="critic", weight=1.0)),
+    "decentralised-sac": DecentralisedSAC(),
+    "centralised-sac": CentralisedSAC(),
+    "maddpg": MADDPG(),
+    "matd3": MADDPG(critics=2, smoothing=0.2, delay=2),
 }

@@ -29,15 +29,16 @@ from marlyap.algorithm import AbstractAlgorithm
 from marlyap.constraint import AbstractConstraint, Unconstrained
 from marlyap.errors import within
 from marlyap.learn import Learnt, polyak
-from marlyap.nets import Actors, Critic, Greedy, Sample, Sampled
+from marlyap.nets import Actors, Critic, Greedy, MeanFieldCritic, Sample, Sampled
+from marlyap.rollout import AbstractExplorer, Policy
 from marlyap.types import Scalar, Transition
 
 
 class Learner(eqx.Module):
     pi: Learnt[Actors]
     pi_mean: Actors  # running mean of pi: the policy that is handed out
-    Q: Learnt[Critic]
-    Q_bar: Critic
+    Q: Learnt[Critic | MeanFieldCritic]
+    Q_bar: Critic | MeanFieldCritic
     log_alpha: Learnt[Scalar]
     L: PyTree  # the constraint's
 
@@ -60,6 +61,7 @@ class MASAC(AbstractAlgorithm):
     normalise: bool = True  # LayerNorm in the critics
     heads: Literal["team", "agent"] = "agent"  # a value for the team, or one for each agent's cost
     shared: bool = False  # one set of actor weights for all agents
+    critic: Literal["joint", "mean-field"] = "joint"  # of everyone, or of one and the others' mean
     average: float = 1e-3  # how fast the policy handed out follows the actor; 1 is the actor itself
     keep_Q: bool = True  # False drops Q from the policy objective (Han et al. 2020)
     constraint: AbstractConstraint = Unconstrained()
@@ -81,13 +83,17 @@ class MASAC(AbstractAlgorithm):
     def init(self, shape, key):
         k_pi, k_Q, k_L = jax.random.split(key, 3)
         pi = Actors(shape, self.actor_width, self.shared, key=k_pi)
-        heads = shape.agents if self.heads == "agent" else 1
-        Q = Critic(shape, self.critic_width, heads, self.normalise, key=k_Q)
+        if self.critic == "mean-field":
+            team = self.heads == "team"
+            Q = MeanFieldCritic(shape, self.critic_width, team, self.normalise, key=k_Q)
+        else:
+            heads = shape.agents if self.heads == "agent" else 1
+            Q = Critic(shape, self.critic_width, heads, self.normalise, key=k_Q)
         log_alpha = jnp.log(jnp.full((), self.alpha, jnp.float32))
         L = self.constraint.init(shape, k_L)
         return Learner(Learnt.of(pi), pi, Learnt.of(Q), Q, Learnt.of(log_alpha), L)
 
-    def J_Q(self, Q: Critic, l: Learner, b: Transition, nxt: Sample) -> Scalar:
+    def J_Q(self, Q: Critic | MeanFieldCritic, l: Learner, b: Transition, nxt: Sample) -> Scalar:
         """Eq. (6), the soft Bellman residual of both critics.
 
         The printed target adds the entropy to a V that already has it; here it enters once,
@@ -154,10 +160,10 @@ class MASAC(AbstractAlgorithm):
         }
         return Learner(pi, pi_mean, Q, Q_bar, log_alpha, L), info
 
-    def explore(self, learner):
+    def explore(self, learner) -> AbstractExplorer:
         return Sampled(learner.pi.value)
 
-    def exploit(self, learner):
+    def exploit(self, learner) -> Policy:
         return Greedy(learner.pi_mean)
 
     def lyapunov(self, learner):
