@@ -48,6 +48,7 @@ FLOORS = """
     draw
     config
     run
+    marl_eval
     fit
     workers
     film
