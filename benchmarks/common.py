@@ -10,6 +10,7 @@ import math
 import os
 import platform
 import re
+import resource
 import statistics
 import subprocess
 import sys
@@ -243,7 +244,7 @@ def ready() -> None:
 
 
 def usage(command: Sequence[str], environment: Mapping[str, str] | None = None) -> Row:
-    """Wall and processor seconds and the peak memory (MB) of a whole process."""
+    """Wall and processor seconds of a whole process, and what it printed."""
     wall = time.perf_counter()
     child = subprocess.Popen(
         command, env=os.environ | dict(environment or {}), stdout=PIPE, stderr=PIPE, text=True
@@ -255,7 +256,6 @@ def usage(command: Sequence[str], environment: Mapping[str, str] | None = None) 
     return {
         "wall s": time.perf_counter() - wall,
         "cpu s": used.ru_utime + used.ru_stime,
-        "peak MB": used.ru_maxrss / (1 << (20 if sys.platform == "darwin" else 10)),
         "said": said,
     }
 
@@ -306,6 +306,14 @@ def machine() -> Row:
         "jax": jax.__version__,
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
     }
+
+
+def peak() -> float:
+    """The most memory this process has had (MB); getrusage would count its parent's too."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        return int(re.search(r"VmHWM:\s+(\d+)", status.read_text())[1]) / 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
 def note(text: str) -> None:

@@ -7,7 +7,6 @@ whole run), `scratch` is what XLA sets aside for an iteration; each team is a pr
 """
 
 import json
-import resource
 import sys
 
 import common
@@ -30,8 +29,7 @@ def child(args):
     scratch = iterate.compiled.memory_analysis().temp_size_in_bytes / 2**20
     for _ in range(2):
         carry = jax.block_until_ready(iterate(carry)[0])
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
-    print(json.dumps(parts | {"scratch MB": scratch, "peak MB": peak}))
+    print(json.dumps(parts | {"scratch MB": scratch, "peak MB": common.peak()}))
 
 
 def main(argv=None):
@@ -40,8 +38,7 @@ def main(argv=None):
         args.agents = args.agents[:1]
     if args.child:
         return child(args)
-    bare = common.usage([sys.executable, "-c", "import marlyap.commands"])
-    rows = [{"agents": "none, imports alone", "peak MB": bare["peak MB"]}]
+    rows = [{"agents": "none, imports alone", "peak MB": common.peak()}]
     for n in args.agents:
         common.note(f"{n} agents")
         command = [sys.executable, __file__, "--child", "1", "--agents", str(n)]

@@ -26,7 +26,7 @@ def main(argv=None):
     def add(name, command, environment=None, repeats=args.repeats):
         common.note(name)
         runs = [common.usage([*python, *command], environment) for _ in range(repeats)]
-        least = {k: min(r[k] for r in runs) for k in ("wall s", "cpu s", "peak MB")}
+        least = {k: min(r[k] for r in runs) for k in ("wall s", "cpu s")}
         rows.append({"what": name} | least)
 
     add("python", ["-c", "pass"])

@@ -108,6 +108,19 @@ def own_code(
     return game, algorithm
 
 
+def changed(game: AbstractGame, overrides: Overrides) -> AbstractGame:
+    """The task of a run with some fields set anew: what its policy was not trained on."""
+    for path, text in overrides.items():
+        part, _, field = path.partition(".")
+        if part != "task":
+            raise UserError(f"--{path}: the policy is trained; only fields of the task can be set.")
+        try:
+            game = config.override(game, field, text)
+        except UserError as error:
+            raise UserError(f"--task.{error}") from None
+    return game
+
+
 def seeds(words: list[str]) -> list[int]:
     """The seeds asked for: whole numbers, each once."""
     try:
@@ -125,7 +138,7 @@ def measure(args: Namespace, overrides: Overrides) -> Result:
     """`evaluate`: every run and controller on the same fresh starts."""
     if not 0 < args.confidence < 1:
         raise UserError(f"confidence: {args.confidence} must lie between 0 and 1.")
-    game, algorithm = own_code(args, overrides)
+    game, algorithm = own_code(args, overrides if args.task else {})
     found: list[tuple[str, str, Any, Evaluation]] = []
     directories = []
     for word in args.runs:
@@ -141,14 +154,16 @@ def measure(args: Namespace, overrides: Overrides) -> Result:
             raise UserError(f"run: there is no run or controller '{word}'; {hint}")
     for directory in expand(directories):
         run = Run.open(directory, game, algorithm)
-        result = evaluate(run.game, run.controller(), args.episodes, args.seed)
+        there = changed(run.game, overrides)
+        controller = run.controller(there) if overrides else run.controller()
+        result = evaluate(there, controller, args.episodes, args.seed)
         found.append((str(directory), group(run), run, result))
     rows = [
         {"name": name, "group": g, "seed": run.seed if run else None} | e.summary(args.confidence)
         for name, g, run, e in found
     ]
     for (_, _, run, _), row in zip(found, rows, strict=True):
-        if run:
+        if run and not overrides:
             store.write_text_atomic(
                 run.directory / "evaluation.json", json.dumps(row, indent=1) + "\n"
             )

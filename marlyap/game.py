@@ -120,8 +120,8 @@ class AbstractGame(eqx.Module):
 
     @property
     def slots(self) -> Int[np.ndarray, "agent slot"]:
-        """Each agent's neighbours in ascending order, padded with -1."""
-        return graphs.neighbours(self.adjacency)
+        """Each agent's neighbours that it observes, in ascending order, padded with -1."""
+        return graphs.neighbours(self.adjacency, graphs.room(self.graph))
 
     @property
     def leads(self) -> Bool[np.ndarray, "agent"]:

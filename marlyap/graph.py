@@ -3,6 +3,10 @@
 complete | path | ring | star      named graphs on n agents
 disk:0.8                           neighbours are those closer than 0.8 m at this instant
 0-1,1-2,1-3                        any edge list
+complete/8                         any of these, of which an agent observes 8 neighbours: the first
+                                   by number, with empty places where it has fewer, so that the
+                                   size of an observation does not depend on how many agents there
+                                   are
 """
 
 import re
@@ -21,6 +25,8 @@ def adjacency(graph: str, n: int) -> Bool[np.ndarray, "agent agent"]:
 
     Raises UserError for an unknown graph, a bad edge, or a graph that is not connected.
     """
+    room(graph)
+    graph = graph.partition("/")[0]
     i = np.arange(n)
     gap = np.abs(i[:, None] - i[None, :])
     if graph == "complete" or disk_radius(graph) is not None:
@@ -49,7 +55,7 @@ def disk_radius(graph: str) -> float | None:
     if not graph.startswith("disk:"):
         return None
     try:
-        radius = float(graph[5:])
+        radius = float(graph[5:].partition("/")[0])
     except ValueError:
         radius = -1.0
     if not 0 < radius < np.inf:
@@ -57,10 +63,26 @@ def disk_radius(graph: str) -> float | None:
     return radius
 
 
-def neighbours(linked: Bool[np.ndarray, "agent agent"]) -> Int[np.ndarray, "agent slot"]:
-    """The neighbours of each agent in ascending order, padded with -1 to the largest degree."""
-    rows = [np.flatnonzero(row) for row in linked]
-    table = np.full((len(rows), max((len(r) for r in rows), default=0)), -1)
+def room(graph: str) -> int | None:
+    """The k of `GRAPH/k`: how many neighbours an observation has places for; None: for all."""
+    _, slash, places = graph.partition("/")
+    if slash and not re.fullmatch(r"[1-9]\d{0,3}", places):
+        raise UserError(
+            f"graph: '{graph}' needs a whole number from 1 to 9999 after the /, as in complete/8."
+        )
+    return int(places) if slash else None
+
+
+def neighbours(
+    linked: Bool[np.ndarray, "agent agent"], places: int | None = None
+) -> Int[np.ndarray, "agent slot"]:
+    """The neighbours of each agent in ascending order, padded with -1 to the largest degree.
+
+    With a number of `places`, the first neighbours, padded with -1 to that number.
+    """
+    rows = [np.flatnonzero(row)[:places] for row in linked]
+    most = max((len(r) for r in rows), default=0)
+    table = np.full((len(rows), most if places is None else places), -1)
     for i, row in enumerate(rows):
         table[i, : len(row)] = row
     return table

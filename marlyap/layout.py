@@ -40,6 +40,18 @@ def batch_last(forward: Forward) -> Forward:
     return rule
 
 
+def rows_as_columns(forward: Forward) -> Forward:
+    """One net for a whole stack: arrays [*stack, row, in, batch] pass through it as columns."""
+
+    def folded(net: Any, x: PyTree) -> PyTree:
+        rows = jax.tree.leaves(x)[0].shape[-3]
+        fold = lambda a: jnp.moveaxis(a, -3, -2).reshape(*a.shape[:-3], a.shape[-2], -1)
+        unfold = lambda y: jnp.moveaxis(y.reshape(*y.shape[:-1], rows, -1), -2, -3)
+        return jax.tree.map(unfold, forward(net, jax.tree.map(fold, x)))
+
+    return folded
+
+
 @jax.custom_vjp
 def matmul(W: Float[Array, "*stack out in"], x: Array) -> Array:
     """W @ x for x of shape [*stack, in, batch], or without the last stack axis if all share x."""

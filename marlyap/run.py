@@ -176,9 +176,22 @@ class Run:
         like = (a.exploit(learner), a.lyapunov(learner))
         return unflatten(like, arrays, str(place))
 
-    def controller(self) -> Decentralised:
-        """The policy as a controller of this run's game."""
-        return Decentralised(self.handed_out()[0], self.game)
+    def controller(self, game: AbstractGame | None = None) -> Decentralised:
+        """The policy as a controller of this run's game, or of another that it fits.
+
+        Raises UserError if it takes other observations, or has other agents' weights.
+        """
+        there = self.game if game is None else game
+        policy = self.handed_out()[0]
+        if game is not None and not _fits(policy, game):
+            was, new = shape(self.game), shape(game)
+            raise UserError(
+                f"task: a policy of {was.agents} agents that observe {was.obs} numbers each does "
+                f"not fit {new.agents} agents that observe {new.obs}; any number of agents needs "
+                "shared weights (--algorithm.shared true) and room for as many neighbours always "
+                "(--task.graph complete/8)."
+            )
+        return Decentralised(policy, there)
 
     def log(self, line: dict[str, Any]) -> None:
         """One line an iteration; numbers that are not finite are left out."""
@@ -195,6 +208,16 @@ class Run:
         kept = [line for line in self.history() if line.get("iteration", 0) <= iteration]
         text = "".join(json.dumps(line) + "\n" for line in kept)
         store.write_text_atomic(self.directory / "log.jsonl", text)
+
+
+def _fits(policy: Policy, game: AbstractGame) -> bool:
+    """Whether the policy takes the game's observations and acts for all of its agents."""
+    act = lambda key: policy(game.observe(game.reset(key)), key)
+    try:
+        action = eqx.filter_eval_shape(act, jax.random.key(0))
+    except (TypeError, ValueError):
+        return False
+    return action.shape == (game.agents, game.dynamics.du)
 
 
 def begin(trainer: Trainer, seed: int) -> Carry:

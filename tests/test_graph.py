@@ -6,7 +6,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.sparse.csgraph import connected_components, shortest_path
 
 from marlyap.errors import UserError
-from marlyap.graph import NAMED, adjacency, disk_radius, hops, neighbours
+from marlyap.graph import NAMED, adjacency, disk_radius, hops, neighbours, room
 
 
 def edges(linked):
@@ -66,6 +66,10 @@ def test_named_graphs_are_connected(graph, n):
         ("disk:nan", 3, r"^graph: 'disk:nan' needs a positive radius"),
         ("disk:inf", 3, r"^graph: 'disk:inf' needs a positive radius"),
         ("9999999-0", 3, r"^graph: .* is none of"),
+        ("path/0", 3, r"^graph: 'path/0' needs a whole number from 1 to 9999 after the /"),
+        ("path/", 3, r"^graph: 'path/' needs a whole number"),
+        ("disk:1/x", 3, r"^graph: 'disk:1/x' needs a whole number"),
+        ("/2", 3, r"^graph: '' is none of"),
     ],
 )
 def test_bad_graphs_are_named(graph, n, says):
@@ -76,6 +80,18 @@ def test_bad_graphs_are_named(graph, n, says):
 def test_disk_radius():
     assert disk_radius("disk:0.8") == 0.8
     assert disk_radius("complete") is None
+    assert disk_radius("disk:0.8/2") == 0.8
+
+
+def test_room_for_neighbours():
+    """What is observed has one size; who is linked does not change."""
+    assert room("path") is None and room("disk:0.8/12") == 12
+    for name in ("complete", "path", "0-1,1-2,2-3"):
+        np.testing.assert_array_equal(adjacency(name + "/2", 4), adjacency(name, 4))
+    table = neighbours(adjacency("complete", 4), 2)
+    np.testing.assert_array_equal(table, [[1, 2], [0, 2], [0, 1], [0, 1]])
+    table = neighbours(adjacency("path", 3), 3)
+    np.testing.assert_array_equal(table, [[1, -1, -1], [0, 2, -1], [1, -1, -1]])
 
 
 def test_neighbours_are_in_order_and_padded():
