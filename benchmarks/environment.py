@@ -6,8 +6,8 @@ random; whole episodes inside one compiled program, on one core with --core.
     python benchmarks/environment.py --core 0
 """
 
-import common
 import equinox as eqx
+import harness
 import jax
 
 from marlyap import Decentralised, Rendezvous
@@ -41,7 +41,7 @@ class Seeing(eqx.Module):
 
 
 def main(argv=None):
-    args = common.arguments(
+    args = harness.arguments(
         argv, __doc__, agents=[3, 5, 32], environments=[1, 64, 1024, 8192], rounds=20
     )
     if args.quick:
@@ -53,7 +53,7 @@ def main(argv=None):
             episodes = 1 if args.quick else max(1, 256 // many)
             jobs[n, many] = job(Rendezvous(agents=n, horizon=horizon), many, episodes)
             steps[n, many] = many * episodes * horizon
-    times = common.turns(jobs, args.rounds)
+    times = harness.turns(jobs, args.rounds)
     rows = [
         {
             "agents": n,
@@ -64,7 +64,7 @@ def main(argv=None):
         }
         for (n, many), t in times.items()
     ]
-    return common.report("environment", rows, args)
+    return harness.report("environment", rows, args)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ whole run), `scratch` is what XLA sets aside for an iteration; each team is a pr
 import json
 import sys
 
-import common
+import harness
 
 
 def child(args):
@@ -29,22 +29,22 @@ def child(args):
     scratch = iterate.compiled.memory_analysis().temp_size_in_bytes / 2**20
     for _ in range(2):
         carry = jax.block_until_ready(iterate(carry)[0])
-    print(json.dumps(parts | {"scratch MB": scratch, "peak MB": common.peak()}))
+    print(json.dumps(parts | {"scratch MB": scratch, "peak MB": harness.peak()}))
 
 
 def main(argv=None):
-    args = common.arguments(argv, __doc__, agents=[3, 5, 16, 64], child=0)
+    args = harness.arguments(argv, __doc__, agents=[3, 5, 16, 64], child=0)
     if args.quick:
         args.agents = args.agents[:1]
     if args.child:
         return child(args)
-    rows = [{"agents": "none, imports alone", "peak MB": common.peak()}]
+    rows = [{"agents": "none, imports alone", "peak MB": harness.peak()}]
     for n in args.agents:
-        common.note(f"{n} agents")
+        harness.note(f"{n} agents")
         command = [sys.executable, __file__, "--child", "1", "--agents", str(n)]
-        said = common.usage(command + ["--quick"] * args.quick)["said"]
+        said = harness.usage(command + ["--quick"] * args.quick)["said"]
         rows.append({"agents": n} | json.loads(said.splitlines()[-1]))
-    return common.report("memory", rows, args)
+    return harness.report("memory", rows, args)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import common
 import equinox as eqx
+import harness
 import jax
 
 from marlyap import MASAC, Lyapunov, Rendezvous, Schedule, Trainer
@@ -36,7 +36,7 @@ def environment(torch):
     python = folder / "bin" / "python"
     done = folder / "complete"
     if not done.exists():
-        common.note(f"making {folder}; this happens once")
+        harness.note(f"making {folder}; this happens once")
         pip = [str(python), "-m", "pip", "install", "--quiet"]
         for command in (
             [sys.executable, "-m", "venv", str(folder)],
@@ -98,7 +98,7 @@ class Peer:
 
 
 def main(argv=None):
-    args = common.arguments(
+    args = harness.arguments(
         argv, __doc__, agents=[3, 5], rounds=8, frames=100, preset="paper", torch="2.13.0"
     )
     if args.quick:
@@ -108,9 +108,9 @@ def main(argv=None):
         if not args.quick:
             peers[n] = jobs[n, "BenchMARL masac"] = Peer(environment(args.torch), n, args.frames)
         for name, constraint in (("masac", {}), ("masac-lyapunov", {"constraint": Lyapunov()})):
-            common.note(f"compiling {name}, {n} agents")
+            harness.note(f"compiling {name}, {n} agents")
             jobs[n, name], counts[n, name] = ours(n, constraint, args.preset, args.quick)
-    times = common.turns(jobs, args.rounds)
+    times = harness.turns(jobs, args.rounds)
     rows = []
     for (n, name), t in times.items():
         if (n, name) in counts:
@@ -129,7 +129,7 @@ def main(argv=None):
     for peer in peers.values():
         peer.process.stdin.close()
         peer.process.wait()
-    return common.report("peer", rows, args, preset=args.preset, versions=versions)
+    return harness.report("peer", rows, args, preset=args.preset, versions=versions)
 
 
 if __name__ == "__main__":

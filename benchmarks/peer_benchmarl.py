@@ -50,7 +50,7 @@ def experiment(agents, frames, environments, horizon):
     )
 
 
-def main():
+def main() -> None:
     agents, frames, environments, horizon = map(int, sys.argv[1:5])
     answers = sys.stdout
     with contextlib.redirect_stdout(sys.stderr):

@@ -11,8 +11,8 @@ import json
 import os
 import time
 
-import common
 import equinox as eqx
+import harness
 import jax
 
 from marlyap import MASAC, Lyapunov, Rendezvous, Schedule, Trainer
@@ -53,7 +53,7 @@ def child(args):
     """One training beside others: its seconds for an iteration, over `rounds` of them."""
     run = job(trainer(args.quick), "alone", 1)
     run()
-    common.ready()
+    harness.ready()
     start = time.perf_counter()
     for _ in range(args.rounds):
         run()
@@ -61,7 +61,7 @@ def child(args):
 
 
 def main(argv=None):
-    args = common.arguments(
+    args = harness.arguments(
         argv, __doc__, seeds=[1, 2, 4], ways=["process", "vmap", "map"], rounds=8, child=0
     )
     if args.quick:
@@ -79,19 +79,19 @@ def main(argv=None):
         command = [__file__, "--child", "1", "--rounds", str(args.rounds)]
         command += ["--quick"] if args.quick else []
         for n in {1, len(cores)} if not args.quick else {1}:
-            answers = common.children([command] * n, cores[:n])
+            answers = harness.children([command] * n, cores[:n])
             add("process", n, max(a["seconds"] for a in answers))
     jobs = {}
     for way in args.ways:
         for n in args.seeds:
             if way != "process" and (n > 1 or way == "vmap"):
-                common.note(f"compiling {way} over {n} seeds")
+                harness.note(f"compiling {way} over {n} seeds")
                 jobs["alone" if n == 1 else way, n] = job(what, way, n)
-    for (way, n), t in common.turns(jobs, args.rounds).items():
+    for (way, n), t in harness.turns(jobs, args.rounds).items():
         add(way, n, t.median)
     for row in rows:
         row["to one"] = row["seeds/hour"] / rows[0]["seeds/hour"]
-    return common.report("seeds", rows, args)
+    return harness.report("seeds", rows, args)
 
 
 if __name__ == "__main__":

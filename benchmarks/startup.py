@@ -10,22 +10,22 @@ import sys
 import tempfile
 from pathlib import Path
 
-import common
+import harness
 
 
 TRAIN = "train rendezvous masac-lyapunov --seeds 0 --steps"
 
 
 def main(argv=None):
-    args = common.arguments(argv, __doc__, repeats=3)
+    args = harness.arguments(argv, __doc__, repeats=3)
     if args.quick:
         args.repeats = 1
     python = [sys.executable]
     rows = []
 
     def add(name, command, environment=None, repeats=args.repeats):
-        common.note(name)
-        runs = [common.usage([*python, *command], environment) for _ in range(repeats)]
+        harness.note(name)
+        runs = [harness.usage([*python, *command], environment) for _ in range(repeats)]
         least = {k: min(r[k] for r in runs) for k in ("wall s", "cpu s")}
         rows.append({"what": name} | least)
 
@@ -40,7 +40,7 @@ def main(argv=None):
             add("first training, one iteration", train(0), cache, 1)
             add("the same, programs kept", train(1), cache, 1)
             add("the same again", train(2), cache, 1)
-    return common.report("startup", rows, args)
+    return harness.report("startup", rows, args)
 
 
 if __name__ == "__main__":

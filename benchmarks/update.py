@@ -14,7 +14,7 @@ products  the time the update's own products take, each measured alone: its own 
 
 from collections import Counter
 
-import common
+import harness
 
 from marlyap import MASAC, Lyapunov, Rendezvous
 from marlyap.algorithms import PRESETS
@@ -48,7 +48,7 @@ def needed(algorithm: MASAC, s: Shape) -> float:
 
 
 def main(argv=None):
-    args = common.arguments(
+    args = harness.arguments(
         argv, __doc__, agents=[3, 5], presets=["tuned", "paper"], rounds=40, count=20
     )
     if args.quick:
@@ -63,20 +63,20 @@ def main(argv=None):
                 plain = MASAC(**smaller, **constraint)
                 algorithm = PRESETS[preset](plain)
                 game = Rendezvous(agents=n)
-                common.note(f"compiling {name}, {n} agents, {preset}")
+                harness.note(f"compiling {name}, {n} agents, {preset}")
                 cases[preset, n, name] = (
-                    common.updates(game, algorithm, args.count, 4 if args.quick else 64),
+                    harness.updates(game, algorithm, args.count, 4 if args.quick else 64),
                     needed(algorithm, shape(game)),
                 )
 
-    square, operations = common.ceiling(size)
+    square, operations = harness.ceiling(size)
     kinds = Counter()
     for case, _ in cases.values():
         kinds |= case.products
     repeats = 2 if args.quick else 100
     singles = {p: p.job(repeats) for p in kinds}
     jobs = {case: updates.run for case, (updates, _) in cases.items()}
-    times = common.turns({"square": square} | jobs | singles, args.rounds)
+    times = harness.turns({"square": square} | jobs | singles, args.rounds)
 
     top = {k: operations / getattr(times["square"], k) for k in ("median", "best", "cpu")}
     rows = []
@@ -93,7 +93,7 @@ def main(argv=None):
                 "best": 1 / time.best,
                 "by cpu": 1 / time.cpu,
                 "needed MFLOP": arithmetic / 1e6,
-                "done MFLOP": common.flops(case.products) / 1e6,
+                "done MFLOP": harness.flops(case.products) / 1e6,
                 "xla MFLOP": case.xla / 1e6,
                 "floor us": 1e6 * arithmetic / top["cpu"],
                 "of floor": arithmetic / top["cpu"] / time.cpu,
@@ -102,7 +102,7 @@ def main(argv=None):
                 "to plain": time.cpu / plain.cpu,
             }
         )
-    return common.report(
+    return harness.report(
         "update",
         rows,
         args,

@@ -1,0 +1,86 @@
+"""Every benchmark runs in its quick form and says what it was made to say."""
+
+import json
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+FOLDER = Path(__file__).parents[1] / "benchmarks"
+SCRIPTS = sorted(p.stem for p in FOLDER.glob("*.py") if p.stem not in ("harness", "peer_benchmarl"))
+COLUMNS = {
+    "agents": {"agents", "updates/s", "growth"},
+    "environment": {"agents", "environments", "steps/s"},
+    "memory": {"agents", "peak MB"},
+    "peer": {"agents", "who", "steps and updates/s"},
+    "seeds": {"way", "seeds", "seeds/hour", "to one"},
+    "startup": {"what", "cpu s"},
+    "update": {"updates/s", "needed MFLOP", "done MFLOP", "of floor", "to plain"},
+}
+
+
+def test_every_benchmark_is_known():
+    assert SCRIPTS == sorted(COLUMNS)
+
+
+@pytest.fixture
+def benchmarks(monkeypatch):
+    """Scripts see the folder they lie in, as when they are started by hand."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    return lambda name: runpy.run_path(str(FOLDER / f"{name}.py"))
+
+
+@pytest.mark.parametrize("name", ["agents", "environment", "peer", "startup", "update"])
+@pytest.mark.usefixtures("quick_compilation")
+def test_quick(name, benchmarks, tmp_path, capsys):
+    benchmarks(name)["main"](["--quick", "--out", str(tmp_path)])
+    written = json.loads((tmp_path / f"{name}-quick.json").read_text())
+    assert written["benchmark"] == name and written["machine"]["jax"]
+    assert written["rows"] and all(COLUMNS[name] <= row.keys() for row in written["rows"])
+    assert str(max(COLUMNS[name])) in capsys.readouterr().out
+    if name == "update":  # no matrix product is computed twice, and none for nothing
+        for row in written["rows"]:
+            assert row["done MFLOP"] <= 1.001 * row["needed MFLOP"]
+    if name == "agents":
+        assert written["rows"][-1]["growth of work"] < 1.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["memory", "seeds"])
+def test_quick_with_processes(name, tmp_path):
+    command = [sys.executable, str(FOLDER / f"{name}.py"), "--quick", "--out", str(tmp_path)]
+    subprocess.run(command, check=True, capture_output=True)
+    written = json.loads((tmp_path / f"{name}-quick.json").read_text())
+    assert written["rows"] and all(COLUMNS[name] <= row.keys() for row in written["rows"][1:])
+
+
+def test_products_of_a_program(benchmarks):
+    """Two products in a loop and one outside; the body of the loop counts once."""
+    import jax
+    import jax.numpy as jnp
+
+    harness = benchmarks("harness")
+
+    def f(w, x):
+        x = jax.lax.fori_loop(0, 7, lambda _, x: jnp.tanh(w @ jnp.tanh(w @ x)), x)
+        return jnp.einsum("oi,nib->nob", w, jnp.stack([x, x + 1]))
+
+    w, x = jnp.ones((48, 48)), jnp.ones((48, 40))
+    found = harness["products"](jax.jit(f).lower(w, x).compile().as_text())
+    assert harness["flops"](found) == (2 + 2) * 2 * 48 * 48 * 40
+
+
+def test_needed_is_counted_by_hand(benchmarks):
+    """The smallest of all updates, written out."""
+    from marlyap import MASAC
+    from marlyap.nets import Shape
+
+    needed = benchmarks("update")["needed"]
+    one = MASAC(batch=1, actor_width=1, critic_width=1, heads="team")
+    actor = 2 * (2 + 1 + 2)  # 2-1-1-2
+    critic = 2 * (4 + 1 + 1)  # 4-1-1-1
+    want = (3 * actor - 2 * 2) + actor + 2 * (critic + (3 * critic - 2 * 4) + 2 * critic)
+    assert needed(one, Shape(agents=1, obs=2, features=3, errors=2, du=1)) == want
