@@ -1,0 +1,344 @@
+"""What the experiments share: cases are trained, measured into tidy tables, and drawn from those.
+
+An experiment NAME on a task leaves in `--results`
+
+    NAME-TASK-curves.csv       one row for each case, seed and iteration
+    NAME-TASK-contraction.csv  one row for each case and seed: how often the cost contracts
+    NAME-TASK-success.csv      one row for each case, seed and radius, with its exact 95 % interval
+    NAME-TASK.png, .json       the figure, and curves and success in the schema of marl-eval
+
+A row that is there is not made again: started anew, a script goes on where it was. Runs are kept in
+`--runs`, without their replay memories once they are measured unless --keep says so.
+"""
+
+import argparse
+import csv
+import io
+import json
+import re
+import shutil
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from marlyap import statistics
+from marlyap.algorithm import AbstractAlgorithm
+from marlyap.certificate import until
+from marlyap.certificates.contraction import Contraction
+from marlyap.errors import UserError
+from marlyap.evaluation import RADII, outcome, share
+from marlyap.fit import fit
+from marlyap.game import AbstractGame
+from marlyap.marl_eval import document
+from marlyap.rollout import rollout
+from marlyap.run import Run
+from marlyap.seeds import stream
+from marlyap.store import write_text_atomic
+from marlyap.tasks import TASKS
+from marlyap.trainer import SCHEDULES, Schedule, Trainer
+from marlyap.workers import train_all
+
+
+Row = dict[str, Any]
+TINY = {"actor_width": 8, "critic_width": 8, "batch": 16}
+QUICK = Schedule(
+    steps=320, environments=4, steps_per_update=32, warmup=160, judge_every=1, judge_episodes=8
+)
+TOGETHER = 4  # cases that are trained before they are measured
+RADIUS = 0.1  # m, of success where there is one only
+T, BETA = 20, 0.1  # the cost is to fall by this share over so many steps
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is trained, and the columns that tell it from the other cases of its experiment."""
+
+    about: Row
+    game: AbstractGame
+    algorithm: AbstractAlgorithm
+    schedule: Schedule
+
+    @property
+    def label(self) -> str:
+        return label(self.about, [c for c in self.about if c not in ("task", "budget")])
+
+    def run(self, root: Path, seed: int) -> Run:
+        """The run of one seed, made if it is not there."""
+        words = [re.sub(r"[^\w.=+-]+", "_", str(v)) for v in self.about.values()]
+        place = root.joinpath(*words, f"seed{seed}")
+        if (place / "run.json").is_file():
+            return Run.open(place)
+        names = {"task": str(self.about["task"]), "algorithm": self.label, "preset": ""}
+        return Run.create(place, Trainer(self.game, self.algorithm, self.schedule), seed, names)
+
+    def quick(self) -> "Case":
+        """The same in a second, to see that it works; it learns nothing."""
+        return replace(self, algorithm=replace(self.algorithm, **TINY), schedule=QUICK)
+
+
+def options(doc: str, **defaults: Any) -> argparse.Namespace:
+    """The command line of every experiment."""
+    p = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    o = {"task": "rendezvous", "steps": 204_800, "seeds": range(5), "episodes": 500} | defaults
+    here = Path(__file__).parent / "results"
+    p.add_argument("--task", default=o["task"], choices=list(TASKS))
+    p.add_argument("--steps", type=int, default=o["steps"], help="environment steps of each run")
+    p.add_argument("--seeds", type=int, nargs="+", default=list(o["seeds"]), help="of training")
+    p.add_argument("--episodes", type=int, default=o["episodes"], help="fresh starts")
+    p.add_argument("--only", default="", help="only cases whose label has this in it")
+    p.add_argument("--list", action="store_true", help="name the cases and stop")
+    p.add_argument("--runs", type=Path, default=Path("runs/experiments"), help="where runs go")
+    p.add_argument("--results", type=Path, default=here, help="where tables and figures go")
+    p.add_argument("--keep", action="store_true", help="keep the checkpoints of measured runs")
+    p.add_argument("--quick", action="store_true", help="two cases, two seeds, seconds")
+    p.add_argument("--draw", action="store_true", help="only the figure, from the tables")
+    return p.parse_args()
+
+
+def schedule(args: argparse.Namespace, **changes: Any) -> Schedule:
+    """The tuned schedule at the budget asked for."""
+    return replace(SCHEDULES["tuned"], steps=args.steps, **changes)
+
+
+def experiment(
+    name: str,
+    cases: Sequence[Case],
+    args: argparse.Namespace,
+    draw: Callable[[argparse.Namespace, str], None] | None = None,
+) -> None:
+    """Train what is missing, measure it, and draw the figure from the tables."""
+    cases = [case for case in cases if args.only in case.label]
+    if args.list:
+        print(*(case.label for case in cases), sep="\n")
+        return
+    args.results.mkdir(parents=True, exist_ok=True)
+    if args.quick:
+        usual = [case.quick() for case in cases if case.game == TASKS[args.task]]
+        cases, args.seeds, args.episodes = usual[:2], args.seeds[:2], 20
+    if not args.draw:
+        for k in range(0, len(cases), TOGETHER):
+            fill(name, cases[k : k + TOGETHER], args)
+    name = f"{name}-{args.task}"
+    export(name, args)
+    (draw or forest)(args, name)
+
+
+def fill(name: str, cases: Sequence[Case], args: argparse.Namespace) -> None:
+    """Train and measure those of the cases whose rows are not there."""
+    root, name = args.runs / name, f"{name}-{args.task}"
+    columns = [*cases[0].about, "seed"]
+    there = {tuple(row[c] for c in columns) for row in read(args, f"{name}-success")}
+    key = lambda case, seed: tuple(str(v) for v in (*case.about.values(), seed))
+    wanted = [(c, s) for c in cases for s in args.seeds if key(c, s) not in there]
+    runs = {key(c, s): c.run(root, s) for c, s in wanted}
+    lost = train(list(runs.values()), args)
+    for case, seed in wanted:
+        run = runs[key(case, seed)]
+        if run.directory in lost:
+            continue
+        about = case.about | {"seed": seed}
+        final, contracts = measure(run.game, run.controller(), args.episodes)
+        kept = ("steps", "updates", "success", "return")
+        curves = [about | {k: line.get(k, "") for k in kept} for line in run.history()]
+        put(args, f"{name}-curves", columns, curves)
+        fall = about | {"T": T, "beta": BETA} | counted(contracts)
+        put(args, f"{name}-contraction", columns, [fall])
+        success = [about | {"radius": r} | counted(final <= r) for r in RADII]
+        put(args, f"{name}-success", columns, success)
+        if not args.keep:
+            shutil.rmtree(run.directory / "checkpoints", ignore_errors=True)
+
+
+def train(runs: list[Run], args: argparse.Namespace) -> set[Path]:
+    """Train to the end; returns where a number stopped being finite."""
+    waiting, lost = [run for run in runs if not run.finished], set()
+    while waiting:
+        try:
+            if args.quick:
+                for run in waiting:
+                    list(fit([run]))
+                return lost
+            parallel = argparse.Namespace(parallel="auto", worker=False)
+            if code := train_all(waiting, parallel):
+                raise SystemExit(code)
+            return lost
+        except UserError as error:
+            gone = {run.directory for run in waiting if str(run.directory) in str(error)}
+            if not gone:
+                raise
+            print(f"given up: {error}")
+            lost |= gone
+            waiting = [run for run in waiting if run.directory not in gone]
+    return lost
+
+
+@eqx.filter_jit
+def _measure(game: AbstractGame, controller: Any, keys: Any) -> tuple[Any, Any]:
+    def one(key):
+        k_start, k_act = jax.random.split(key)
+        long = rollout(game, controller, game.reset(k_start), k_act, game.horizon + 1)
+        least = Contraction(T=min(T, game.horizon)).judge(game, None, long).figures["beta"]
+        return outcome(game, until(long, game.horizon)).final, least
+
+    return jax.vmap(one)(keys)
+
+
+def measure(game: AbstractGame, controller: Any, episodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """From the starts of `marlyap evaluate`: final distances (m), and whether the cost contracts.
+
+    It does (certificate C3) if over every T steps that begin above the radius it falls by BETA.
+    """
+    final, least = _measure(game, controller, jax.random.split(stream(0, "evaluate"), episodes))
+    return np.asarray(final), np.asarray(least) >= BETA
+
+
+def counted(hits: np.ndarray) -> Row:
+    """Columns for a share of episodes."""
+    s = share(hits, 0.95)
+    rate = {k: s[k] for k in ("episodes", "successes", "success_rate")}
+    return rate | dict(zip(("low", "high"), s["interval"], strict=True))
+
+
+def put(args: argparse.Namespace, name: str, key: list[str], rows: list[Row]) -> None:
+    """Add rows to a table, in the place of those it has with the same key; all or nothing."""
+    of = lambda row: tuple(str(row[c]) for c in key)
+    new = {of(row) for row in rows}
+    table = [row for row in read(args, name) if of(row) not in new] + rows
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
+    write_text_atomic(args.results / f"{name}.csv", text.getvalue())
+
+
+def read(args: argparse.Namespace, name: str) -> list[dict[str, str]]:
+    """A table; empty if it is not there."""
+    path = args.results / f"{name}.csv"
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+NUMBERS = (
+    "radius episodes successes success_rate low high T beta steps updates success return".split()
+)
+
+
+def label(row: Row, columns: Iterable[str]) -> str:
+    """What a case is called."""
+    return " ".join(str(row[c]) for c in columns if row[c] != "")
+
+
+def labels(rows: Sequence[Row]) -> list[str]:
+    """What the case of each row of a table is called, by the columns that tell them apart."""
+    about = [c for c in (rows[0] if rows else ()) if c not in ("task", "seed", *NUMBERS)]
+    telling = [c for c in about if len({row[c] for row in rows}) > 1]
+    return [label(row, telling or about) for row in rows]
+
+
+class Estimate(NamedTuple):
+    """Interquartile mean over seeds, its 95 % interval over seeds and episodes, and the seeds'."""
+
+    mean: float
+    low: float
+    high: float
+    seeds: np.ndarray
+
+
+def estimate(rows: Iterable[Row]) -> Estimate:
+    """Of one case, from the counts of its seeds; exact where there is one seed."""
+    counts = [(int(row["successes"]), int(row["episodes"])) for row in rows]
+    rates = np.array([k / n for k, n in counts])
+    if len(counts) == 1:
+        low, high = statistics.clopper_pearson(*counts[0], 0.95)
+    else:
+        episodes = [np.repeat([1.0, 0.0], [k, n - k]) for k, n in counts]
+        low, high = statistics.two_level_bootstrap(episodes)
+    return Estimate(statistics.iqm(rates), low, high, rates)
+
+
+def estimates(args: argparse.Namespace, name: str) -> dict[str, dict[str, Estimate]]:
+    """For each measure, the estimate of each case, in the order of the tables."""
+    success = [row for row in read(args, f"{name}-success") if row["radius"] in ("0.05", "0.1")]
+    contraction = read(args, f"{name}-contraction")
+    groups: dict[str, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
+    for row, case in zip(success, labels(success), strict=True):
+        groups[f"success within {row['radius']} m"][case].append(row)
+    for row, case in zip(contraction, labels(contraction), strict=True):
+        groups[f"cost falls by {row['beta']} in {row['T']} steps"][case].append(row)
+    return {m: {c: estimate(rows) for c, rows in by.items()} for m, by in groups.items()}
+
+
+def forest(args: argparse.Namespace, name: str) -> None:
+    """The figure, and the same on standard output: a line a case, a panel a measure."""
+    found = estimates(args, name)
+    for measure, cases in found.items():
+        print(f"{name}, {measure}: interquartile mean over seeds, 95 % interval, worst seed")
+        for case, e in cases.items():
+            worst = f"{e.seeds.min():.3f} of {len(e.seeds)}"
+            print(f"  {case:<44} {e.mean:.4f} [{e.low:.4f}, {e.high:.4f}]  {worst}")
+    order = list(dict.fromkeys(case for cases in found.values() for case in cases))
+    figure, panels = canvas(len(found), 3.0, 0.9 + 0.24 * len(order))
+    for axes, (measure, cases) in zip(panels, found.items(), strict=True):
+        for case, e in cases.items():
+            y = -order.index(case)
+            axes.plot(e.seeds, [y] * len(e.seeds), "|", color="#9a9da6", markersize=7)
+            axes.plot([e.low, e.high], [y, y], color="#0b62a4", linewidth=1.6)
+            axes.plot(e.mean, y, "o", color="#0b62a4", markersize=4)
+        axes.set(xlim=(-0.03, 1.03), title=measure, yticks=[-k for k in range(len(order))])
+        axes.set_yticklabels(order if axes is panels[0] else [], fontsize=7)
+    save(figure, args.results / f"{name}.png")
+
+
+def canvas(panels: int, width: float, height: float) -> tuple[Any, list[Any]]:
+    """A figure with several panels side by side."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width * panels + 1.5, height), layout="constrained")
+    grid = list(np.ravel(figure.subplots(1, panels, squeeze=False)))
+    for axes in grid:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="x", color="#ecebe6")
+        axes.tick_params(labelsize=7)
+        axes.title.set_fontsize(8)
+    return figure, grid
+
+
+def save(figure: Any, path: Path) -> None:
+    """Write the figure, and say where."""
+    for axes in figure.axes:
+        axes.title.set_fontsize(8)
+    figure.savefig(path, dpi=150)
+    print(path)
+
+
+def export(name: str, args: argparse.Namespace) -> None:
+    """The tables as marl-eval reads them, where it could compare the runs."""
+    success = [row for row in read(args, f"{name}-success") if float(row["radius"]) == RADIUS]
+    curves = [row for row in read(args, f"{name}-curves") if row["success"]]
+    if not success:
+        return
+    measured = ((success, "success_rate"), (curves, "success"))
+    final, looks = (
+        [
+            {k: row[k] for k in ("task", "seed", "steps") if k in row}
+            | {"algorithm": case, "success": row[column]}
+            for row, case in zip(rows, labels(rows), strict=True)
+        ]
+        for rows, column in measured
+    )
+    try:
+        text = json.dumps(document(looks, final), indent=1) + "\n"
+    except UserError as error:
+        print(f"not exported for marl-eval: {error}")
+    else:
+        write_text_atomic(args.results / f"{name}.json", text)

@@ -1,0 +1,21 @@
+"""Every algorithm at the same budget: references, controls and both of the paper's.
+
+./run python experiments/references.py
+./run python experiments/references.py --task rendezvous-path5 --steps 409600
+"""
+
+from common import Case, experiment, options, schedule
+
+from marlyap.algorithms import ALGORITHMS
+from marlyap.tasks import TASKS
+
+
+def cases(args):
+    for name, algorithm in ALGORITHMS.items():
+        about = {"task": args.task, "algorithm": name, "budget": args.steps}
+        yield Case(about, TASKS[args.task], algorithm, schedule(args))
+
+
+if __name__ == "__main__":
+    args = options(__doc__)
+    experiment("references", list(cases(args)), args)
