@@ -5,13 +5,34 @@ import abc
 import equinox as eqx
 from jaxtyping import PyTree
 
+from marlyap.game import AbstractGame
 from marlyap.nets import LyapunovNet, NormNet, Shape
 from marlyap.rollout import AbstractExplorer, Policy
-from marlyap.types import Key, Scalar, Transition
+from marlyap.types import Key, Keys, Scalar, Transition
 
 
 class AbstractAlgorithm(eqx.Module):
-    """The fields of a subclass are its hyperparameters: the object is its own configuration."""
+    """The fields of a subclass are its hyperparameters: the object is its own configuration.
+
+    A learning rule is one of two kinds, below: it learns from a memory of what was played, or by
+    differentiating the game itself.
+    """
+
+    @abc.abstractmethod
+    def init(self, shape: Shape, key: Key) -> PyTree:
+        """Fresh parameters and optimiser memories."""
+
+    @abc.abstractmethod
+    def exploit(self, learner: PyTree) -> Policy:
+        """The deterministic policy that is evaluated, certified and deployed."""
+
+    @abc.abstractmethod
+    def lyapunov(self, learner: PyTree) -> LyapunovNet | NormNet | None:
+        """The Lyapunov function (features, action) -> L learnt so far, if there is one."""
+
+
+class AbstractOffPolicy(AbstractAlgorithm):
+    """Learns from transitions that any policy may have left in the replay memory."""
 
     gamma: eqx.AbstractVar[float]
     batch: eqx.AbstractVar[int]
@@ -23,10 +44,6 @@ class AbstractAlgorithm(eqx.Module):
         """T of L_target, and whether episodes are to be rolled T steps further to have it."""
 
     @abc.abstractmethod
-    def init(self, shape: Shape, key: Key) -> PyTree:
-        """Fresh parameters and optimiser memories."""
-
-    @abc.abstractmethod
     def update(
         self, learner: PyTree, b: Transition, key: Key, decay: Scalar
     ) -> tuple[PyTree, dict[str, Scalar]]:
@@ -36,10 +53,12 @@ class AbstractAlgorithm(eqx.Module):
     def explore(self, learner: PyTree) -> AbstractExplorer:
         """The policy that collects data."""
 
-    @abc.abstractmethod
-    def exploit(self, learner: PyTree) -> Policy:
-        """The deterministic policy that is evaluated, certified and deployed."""
+
+class AbstractModelBased(AbstractAlgorithm):
+    """Learns from episodes that it plays itself, whose gradient it takes through the dynamics."""
 
     @abc.abstractmethod
-    def lyapunov(self, learner: PyTree) -> LyapunovNet | NormNet | None:
-        """The Lyapunov function (features, action) -> L learnt so far, if there is one."""
+    def improve(
+        self, learner: PyTree, game: AbstractGame, keys: Keys, decay: Scalar
+    ) -> tuple[PyTree, dict[str, Scalar]]:
+        """One gradient step on the episodes of these keys; the dict has at least `return`."""

@@ -30,7 +30,7 @@ from marlyap.recheck import recheck
 from marlyap.report import Film, Page, html
 from marlyap.run import Run, expand
 from marlyap.tasks import TASKS
-from marlyap.trainer import SCHEDULES, Trainer
+from marlyap.trainer import Trainer, schedule_for
 from marlyap.workers import train_all
 
 
@@ -81,7 +81,7 @@ def assemble(args: Namespace, overrides: Overrides) -> Trainer:
         raise UserError(f"preset: '{preset}' is unknown; {config.suggest(preset, PRESETS)}")
     game = config.load(args.task, AbstractGame)
     algorithm = PRESETS[preset](config.load(args.algorithm, AbstractAlgorithm))
-    schedule = SCHEDULES[preset]
+    schedule = schedule_for(algorithm, preset)
     parts = {"task": game, "algorithm": algorithm, "schedule": schedule}
     for path, text in overrides.items():
         part, _, field = path.partition(".")

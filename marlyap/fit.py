@@ -18,7 +18,7 @@ from marlyap.game import AbstractGame
 from marlyap.nets import LyapunovNet, NormNet
 from marlyap.rollout import Decentralised, Policy
 from marlyap.run import Run, begin
-from marlyap.trainer import SCHEDULES, Carry, Schedule, Trainer
+from marlyap.trainer import Carry, Schedule, Trainer, schedule_for
 
 
 SHARE = 0.02  # of the training time that checkpoints may take
@@ -106,16 +106,19 @@ class Trained:
 def train(
     game: AbstractGame,
     algorithm: AbstractAlgorithm,
-    schedule: Schedule = SCHEDULES["tuned"],
+    schedule: Schedule | None = None,
     seed: int = 0,
     on_iteration: Callable[[dict[str, Any]], None] | None = None,
 ) -> Trained:
     """Train one team in memory; nothing is written. For long trainings use `Run` and `fit`.
 
+    Without a schedule, the tuned one for this algorithm.
+
     `on_iteration` is given one dict an iteration. Raises Diverged (a UserError) when a number
     stops being finite.
     """
-    trainer, history, clock = Trainer(game, algorithm, schedule), [], time.monotonic()
+    trainer = Trainer(game, algorithm, schedule or schedule_for(algorithm))
+    history, clock = [], time.monotonic()
     first = carry = _stack([begin(trainer, seed)])
     for done, carry, rows in advance(trainer, first):  # noqa: B007
         line = _line(trainer, seed, done, time.monotonic() - clock, rows, 0)

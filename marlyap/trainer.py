@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
-from marlyap.algorithm import AbstractAlgorithm
+from marlyap.algorithm import AbstractAlgorithm, AbstractModelBased, AbstractOffPolicy
 from marlyap.errors import within
 from marlyap.evaluation import outcomes
 from marlyap.game import AbstractGame
@@ -88,6 +88,8 @@ class Trainer(eqx.Module):
 
     @property
     def updates_per_iteration(self) -> int:
+        if isinstance(self.algorithm, AbstractModelBased):
+            return 1
         return max(1, self.steps_per_iteration // self.schedule.steps_per_update)
 
     def begin(self, key: Key) -> Carry:
@@ -95,9 +97,10 @@ class Trainer(eqx.Module):
         k_init, k_warm, key = jax.random.split(key, 3)
         s, random = self.schedule, Uniform(self.game.dynamics.du)
         learner = self.algorithm.init(shape(self.game), k_init)
-        episodes = max(1, -(-s.warmup // self.game.horizon))
+        remembers = isinstance(self.algorithm, AbstractOffPolicy)
+        episodes = max(1, -(-s.warmup // self.game.horizon)) if remembers else 1
         warm = self.play(random, k_warm, episodes)
-        needed = episodes + self.iterations * s.environments
+        needed = episodes + self.iterations * s.environments if remembers else 1
         rows = min(needed, max(s.capacity // self.game.horizon, episodes, s.environments))
         memory = Replay.empty(jax.tree.map(lambda x: x[0], warm), rows).add(warm)
         best = self.algorithm.exploit(learner)
@@ -106,27 +109,38 @@ class Trainer(eqx.Module):
     def iterate(self, carry: Carry) -> tuple[Carry, dict[str, Scalar]]:
         """Play, remember, learn; the dict is for the log."""
         key, k_play, k_learn = jax.random.split(carry.key, 3)
-        new = self.play(self.algorithm.explore(carry.learner), k_play, self.schedule.environments)
-        memory = carry.memory.add(new)
-        decay = self.decay(carry.iteration)
-        dynamic, static = eqx.partition(carry.learner, eqx.is_array)
+        decay, memory, a = self.decay(carry.iteration), carry.memory, self.algorithm
+        if isinstance(a, AbstractModelBased):
+            keys = jax.random.split(k_play, self.schedule.environments)
+            learner, info = a.improve(carry.learner, self.game, keys, decay)
+        else:
+            assert isinstance(a, AbstractOffPolicy)
+            new = self.play(a.explore(carry.learner), k_play, self.schedule.environments)
+            memory = memory.add(new)
+            learner, info = self.learn(carry.learner, memory, k_learn, decay)
+            info["return"] = jnp.mean(jnp.sum(jnp.mean(new.reward, axis=2), axis=1))
+            for name in ("obs", "features", "action", "reward", "cost"):
+                info[f"bad_{name}"] = jnp.sum(~jnp.isfinite(getattr(new, name)))
+        done = carry.iteration + 1
+        return Carry(learner, memory, key, done, carry.best, carry.score), info
 
-        def learn(dynamic, key):
+    def learn(
+        self, learner: PyTree, memory: Replay, key: Key, decay: Scalar
+    ) -> tuple[PyTree, dict[str, Scalar]]:
+        """An iteration's updates, each on a fresh batch from the memory."""
+        a = self.algorithm
+        assert isinstance(a, AbstractOffPolicy)
+        dynamic, static = eqx.partition(learner, eqx.is_array)
+
+        def one(dynamic, key):
             k_sample, k_update = jax.random.split(key)
-            a = self.algorithm
             batch = memory.sample(k_sample, a.batch, a.gamma, a.n_step)
             learner, info = a.update(eqx.combine(dynamic, static), batch, k_update, decay)
             return eqx.filter(learner, eqx.is_array), info
 
-        keys = jax.random.split(k_learn, self.updates_per_iteration)
-        dynamic, info = jax.lax.scan(learn, dynamic, keys)
-        info = jax.tree.map(jnp.mean, info)
-        info["return"] = jnp.mean(jnp.sum(jnp.mean(new.reward, axis=2), axis=1))
-        for name in ("obs", "features", "action", "reward", "cost"):
-            info[f"bad_{name}"] = jnp.sum(~jnp.isfinite(getattr(new, name)))
-        learner = eqx.combine(dynamic, static)
-        done = carry.iteration + 1
-        return Carry(learner, memory, key, done, carry.best, carry.score), info
+        keys = jax.random.split(key, self.updates_per_iteration)
+        dynamic, info = jax.lax.scan(one, dynamic, keys)
+        return eqx.combine(dynamic, static), jax.tree.map(jnp.mean, info)
 
     def judge(self, carry: Carry) -> tuple[Carry, dict[str, Scalar]]:
         """Look at the policy from starts kept for this alone, and keep it if it is the best.
@@ -148,7 +162,7 @@ class Trainer(eqx.Module):
     def play(self, policy: AbstractExplorer, key: Key, episodes: int) -> Episode:
         """`episodes` fresh episodes, as the memory keeps them."""
         game = self.game
-        T, further = self.algorithm.foresight
+        T, further = getattr(self.algorithm, "foresight", (1, False))
         controller = Decentralised(policy, game)
 
         def one(key):
@@ -191,4 +205,11 @@ SCHEDULES = {
         decay_episodes=2_000,
         judge_every=50,
     ),
+    # 1,500 updates on 128 episodes each: playing is cheap where no critic is to be learnt.
+    "model-based": Schedule(steps=7_680_000, environments=128, judge_every=50),
 }
+
+
+def schedule_for(algorithm: AbstractAlgorithm, preset: str = "tuned") -> Schedule:
+    """The schedule of that name, or the one for rules that differentiate the game."""
+    return SCHEDULES["model-based" if isinstance(algorithm, AbstractModelBased) else preset]

@@ -7,6 +7,7 @@ references, which the paper does not have, the same networks and numbers.
 import dataclasses
 
 from marlyap.algorithm import AbstractAlgorithm
+from marlyap.algorithms.apg import APG as APG
 from marlyap.algorithms.maddpg import MADDPG as MADDPG
 from marlyap.algorithms.masac import MASAC as MASAC
 from marlyap.algorithms.sac import (
@@ -43,5 +44,7 @@ ALGORITHMS: dict[str, AbstractAlgorithm] = {
     "decentralised-sac": DecentralisedSAC(),
     "centralised-sac": CentralisedSAC(),
     "maddpg": MADDPG(),
+    "apg": APG(),
+    "apg-lyapunov": APG(weight=1.0),
     "matd3": MADDPG(critics=2, smoothing=0.2, delay=2),
 }

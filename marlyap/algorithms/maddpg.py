@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from marlyap.algorithm import AbstractAlgorithm
+from marlyap.algorithm import AbstractOffPolicy
 from marlyap.errors import within
 from marlyap.learn import Learnt, polyak
 from marlyap.nets import Actors, Critic, Greedy, Noisy
@@ -38,7 +38,7 @@ class Learner(eqx.Module):
     updates: Int[Array, ""]
 
 
-class MADDPG(AbstractAlgorithm):
+class MADDPG(AbstractOffPolicy):
     """One central critic, one deterministic actor per agent on its own observation."""
 
     gamma: float = 0.95  # discount

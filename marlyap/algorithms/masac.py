@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from marlyap.algorithm import AbstractAlgorithm
+from marlyap.algorithm import AbstractOffPolicy
 from marlyap.constraint import AbstractConstraint, Unconstrained
 from marlyap.errors import within
 from marlyap.learn import Learnt, polyak
@@ -43,7 +43,7 @@ class Learner(eqx.Module):
     L: PyTree  # the constraint's
 
 
-class MASAC(AbstractAlgorithm):
+class MASAC(AbstractOffPolicy):
     """One central twin critic, one Gaussian actor per agent on its own observation."""
 
     gamma: float = 0.95  # discount
@@ -125,24 +125,21 @@ class MASAC(AbstractAlgorithm):
         l = learner
         noise = jax.random.normal(key, (2, *b.action.shape))
 
-        # a ~ pi_phi(. | s_t) and a_{t+1} ~ pi_phi(. | s_{t+1}): one pass serves every objective
-        draw = lambda pi: (
-            jax.vmap(pi.sample)(b.obs, noise[0], b.action),
-            jax.vmap(pi.sample)(b.next_obs, noise[1], b.action),
+        # a ~ pi_phi(. | s_t) and a_{t+1} ~ pi_phi(. | s_{t+1}): the same for every objective
+        draw = lambda pi, b, noise_now, noise_next: (
+            pi.sample(b.obs, noise_now, b.action),
+            pi.sample(b.next_obs, noise_next, b.action),
         )
-        (now, nxt), chain_rule = eqx.filter_vjp(draw, l.pi.value)
+        now, nxt = jax.vmap(lambda *one: draw(l.pi.value, *one))(b, *noise)
 
         # theta <- theta - iota_Q grad J_Q
         J_Q = lambda Q, b, nxt: self.J_Q(Q, l, b, nxt)
         Q, loss_Q = l.Q.descend(J_Q, b, nxt, rate=decay * self.rate_Q)
         l = eqx.tree_at(lambda l: l.Q, l, Q)
 
-        # phi <- phi - iota_pi grad J_pi, eq. (11): first to the actions, then through the actors
-        J_pi = lambda now, nxt, b: self.J_pi(now, nxt, l, b)
-        E_J_pi = jax.value_and_grad(lambda drawn: jnp.mean(jax.vmap(J_pi)(drawn[0], drawn[1], b)))
-        loss_pi, to_actions = E_J_pi((now, nxt))
-        (gradient,) = chain_rule(to_actions)
-        pi = l.pi.step(gradient, decay * self.rate_pi)
+        # phi <- phi - iota_pi grad J_pi, eq. (11); XLA merges this drawing with the one above
+        J_pi = lambda pi, b, *noise: self.J_pi(*draw(pi, b, *noise), l, b)
+        pi, loss_pi = l.pi.descend(J_pi, b, *noise, rate=decay * self.rate_pi)
 
         # alpha <- alpha - iota_alpha grad J_alpha
         log_alpha, _ = l.log_alpha.descend(self.J_alpha, now, rate=decay * self.rate_alpha)
