@@ -1,6 +1,10 @@
 """MASAC with and without the Lyapunov term, many seeds: learning curves, success over 500 starts.
 
+The third case is the control: the same network of the next T costs, with the policy asked to make
+it small and not to make it fall.
+
     ./run python experiments/headline.py            ten seeds of each
+    ./run python experiments/headline.py --steps 51200    a quarter of the budget
     ./run python experiments/headline.py --quick    seconds, to see that it works
     ./run python experiments/headline.py --draw     the figures again, from the tables alone
 
@@ -13,17 +17,20 @@ import numpy as np
 from common import RADIUS, Case, experiment, forest, options, read, schedule
 
 from marlyap import draw, statistics
-from marlyap.algorithms import ALGORITHMS
+from marlyap.algorithms import ALGORITHMS, MASAC
+from marlyap.constraints import Lyapunov
 from marlyap.tasks import TASKS
+from marlyap.trainer import SCHEDULES
 
 
 COMPARED = ("masac", "masac-lyapunov")
+CONTROL = {"masac-critic": MASAC(constraint=Lyapunov(reading="critic", weight=1.0))}
 
 
 def cases(args):
-    for name in COMPARED:
+    for name in (*COMPARED, *CONTROL):
         about = {"task": args.task, "algorithm": name}
-        yield Case(about, TASKS[args.task], ALGORITHMS[name], schedule(args))
+        yield Case(about, TASKS[args.task], (ALGORITHMS | CONTROL)[name], schedule(args))
 
 
 def curves(args, name):
@@ -54,4 +61,5 @@ def curves(args, name):
 
 if __name__ == "__main__":
     args = options(__doc__, seeds=range(10))
-    experiment("headline", list(cases(args)), args, curves)
+    name = "headline" if args.steps >= SCHEDULES["tuned"].steps else f"headline-{args.steps}"
+    experiment(name, list(cases(args)), args, curves)
