@@ -31,6 +31,7 @@ from marlyap import statistics
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.certificate import until
 from marlyap.certificates.contraction import Contraction
+from marlyap.config import fields
 from marlyap.errors import UserError
 from marlyap.evaluation import RADII, outcome, share
 from marlyap.fit import fit
@@ -79,7 +80,8 @@ class Case:
 
     def quick(self) -> "Case":
         """The same in a second, to see that it works; it learns nothing."""
-        return replace(self, algorithm=replace(self.algorithm, **TINY), schedule=QUICK)
+        tiny = {k: v for k, v in TINY.items() if k in fields(self.algorithm)}
+        return replace(self, algorithm=replace(self.algorithm, **tiny), schedule=QUICK)
 
 
 def options(doc: str, **defaults: Any) -> argparse.Namespace:
@@ -166,7 +168,7 @@ def train(runs: list[Run], args: argparse.Namespace) -> set[Path]:
                 for run in waiting:
                     list(fit([run]))
                 return lost
-            parallel = argparse.Namespace(parallel="auto", worker=False)
+            parallel = argparse.Namespace(parallel="auto", worker=False, task="", algorithm="")
             if code := train_all(waiting, parallel):
                 raise SystemExit(code)
             return lost
