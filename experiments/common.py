@@ -296,7 +296,8 @@ def forest(args: argparse.Namespace, name: str) -> None:
             axes.plot(e.seeds, [y] * len(e.seeds), "|", color="#9a9da6", markersize=7)
             axes.plot([e.low, e.high], [y, y], color="#0b62a4", linewidth=1.6)
             axes.plot(e.mean, y, "o", color="#0b62a4", markersize=4)
-        axes.set(xlim=(-0.03, 1.03), title=measure, yticks=[-k for k in range(len(order))])
+        axes.set(xlim=(-0.03, 1.03), ylim=(0.6 - len(order), 0.6), title=measure)
+        axes.set_yticks([-k for k in range(len(order))])
         axes.set_yticklabels(order if axes is panels[0] else [], fontsize=7)
     save(figure, args.results / f"{name}.png")
 
