@@ -205,8 +205,8 @@ SCHEDULES = {
         decay_episodes=2_000,
         judge_every=50,
     ),
-    # 1,500 updates on 128 episodes each: playing is cheap where no critic is to be learnt.
-    "model-based": Schedule(steps=7_680_000, environments=128, judge_every=50),
+    # 1,000 updates on 64 episodes each: playing is cheap where no critic is to be learnt.
+    "model-based": Schedule(steps=2_560_000, judge_every=50),
 }
 
 
