@@ -717,7 +717,7 @@ def test_what_does_not_fit_together_is_refused():
         (dict(horizon=0), "horizon"),
         (dict(weight=-0.1), "weight"),
     ):
-        with pytest.raises(UserError, match=f"^constraint.{field}"):
+        with pytest.raises(UserError, match=f"^{field}: "):
             Lyapunov(**bad)
 
 
