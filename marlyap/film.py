@@ -2,20 +2,24 @@
 
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from marlyap import config
+from marlyap import config, graph as graphs, store
+from marlyap.certificate import start_of, until
 from marlyap.errors import UserError
 from marlyap.evaluation import Evaluation, episode, evaluate, pooled
 from marlyap.game import AbstractGame
-from marlyap.rollout import Controller
+from marlyap.identity import policy_hash
+from marlyap.lyapunov_function import CostSum, at_target
+from marlyap.rollout import Controller, rollout
 from marlyap.run import Run, versions
-from marlyap.seeds import stream
-from marlyap.types import Key, Trajectory
+from marlyap.seeds import Purpose, stream
+from marlyap.types import Key, State, Trajectory
 
 
 CERTIFIED = (
@@ -31,6 +35,7 @@ def page(runs: Sequence[Run], episodes: int, seed: int, command: str = "") -> di
     names = sorted({run.names["algorithm"] for run in runs})
     tasks = sorted({run.names["task"] for run in runs})
     game = runs[0].game
+    certified = certificates(runs[0])
     count = f"{len(runs)} training seed{'s' * (len(runs) > 1)}"
     return {
         "title": f"{' and '.join(tasks)}: {' and '.join(names)}",
@@ -46,7 +51,9 @@ def page(runs: Sequence[Run], episodes: int, seed: int, command: str = "") -> di
             "text": CERTIFIED,
         },
         "runs": [_row(run, result) for run, result in zip(runs, results, strict=True)],
-        "films": films(runs[0], results[0], seed),
+        "films": [*films(runs[0], results[0], seed), *certified["films"]],
+        "certificates": certified["certificates"],
+        "slices": certified["slices"],
         "config": {part: config.record(value) for part, value in vars(runs[0].trainer).items()},
         "versions": versions(),
         "command": command,
@@ -134,3 +141,99 @@ def strip(game: AbstractGame, path: Trajectory, lyapunov: jax.Array | None) -> d
         "cost": [*cost.tolist(), float(distance[-1])] if len(cost) else [],
         "success": bool(distance[-1] <= game.radius),
     }
+
+
+def certificates(run: Run) -> dict[str, list[dict[str, Any]]]:
+    """What `certify` left beside a run: its claims, its worst cases as films, its V along slices.
+
+    A certificate of another policy than the run's is left out, and so is V that is not a cost sum.
+    """
+    shown: dict[str, list[dict[str, Any]]] = {"certificates": [], "films": [], "slices": []}
+    place, controller = run.directory / "certificate", run.controller()
+    if not place.is_dir():
+        return shown
+    _, meta = store.read(place, "certificate")
+    if meta["policy"] != policy_hash(controller):
+        return shown
+    V = None
+    if meta["V"]["kind"] == "CostSum":
+        V = CostSum(controller=controller, T=meta["V"]["T"], ball=meta["V"]["ball"])
+    worst: dict[tuple[str, int], list[str]] = {}
+    for name, verdict in meta["verdicts"].items():
+        known = {k.replace("_", " "): v for k, v in verdict["scope"].items() if v is not None}
+        scope = ", ".join(f"{k}: {v}" for k, v in known.items())
+        row = {k: verdict[k] for k in ("claim", "evidence", "holds", "bound", "confidence")}
+        shown["certificates"].append(row | {"name": name, "scope": scope})
+        if {"purpose", "episode"} <= {*(verdict["worst"] or ())} and "change" not in verdict[
+            "worst"
+        ]:
+            found = verdict["worst"]["purpose"], verdict["worst"]["episode"]
+            worst.setdefault(found, []).append(name)
+    for (purpose, number), names in worst.items():
+        start = start_of(run.game, meta["seed"], cast(Purpose, purpose), number)
+        path, values = _replay(run.game, controller, V, start)
+        where = {"label": f"worst for {', '.join(names)}", "start": number, "run": run.title}
+        shown["films"].append(strip(run.game, path, values) | where)
+    if V is not None:
+        level = meta["verdicts"].get("basin", {}).get("figures", {}).get("level")
+        shown["slices"] = [slice_of(run.game, V, agent, level) for agent in _extremes(run.game)]
+    return shown
+
+
+@eqx.filter_jit
+def _replay(
+    game: AbstractGame, controller: Controller, V: CostSum | None, start: State
+) -> tuple[Trajectory, jax.Array | None]:
+    """Two horizons from a start, and V along them."""
+    beyond = 0 if V is None else V.beyond
+    path = rollout(game, controller, start, jax.random.key(0), 2 * game.horizon + beyond)
+    seen = until(path, 2 * game.horizon)
+    return seen, None if V is None else V.along(game, path, 2 * game.horizon + 1)
+
+
+def _extremes(game: AbstractGame) -> list[int]:
+    """A leader, and the agent that is farthest from all leaders."""
+    hops = graphs.hops(game.adjacency, game.leaders)
+    return sorted({int(np.argmin(hops)), int(np.argmax(hops))})
+
+
+def slice_of(
+    game: AbstractGame, V: CostSum, agent: int, level: float | None, side: int = 41
+) -> dict[str, Any]:
+    """Contours of V where one agent rests beside the goal (m) and all others on it."""
+    import contourpy
+
+    reach = 1.5
+    grid = np.linspace(-reach, reach, side)
+    values = np.asarray(_plane(game, V, np.asarray(agent), grid))
+    levels = [float(v) for v in np.quantile(values, [0.03, 0.1, 0.25, 0.5, 0.75, 0.95])]
+    known = level is not None and np.min(values) < level < np.max(values)
+    lines = contourpy.contour_generator(grid, grid, values)
+    return {
+        "label": f"agent {agent}, {'a leader' if game.leads[agent] else 'a follower'}",
+        "reach": reach,
+        "radius": game.radius,
+        "contours": [
+            {
+                "level": v,
+                "lines": [np.asarray(line).round(3).tolist() for line in lines.lines(v)],
+                "certified": v == level,
+            }
+            for v in [*levels, *([level] if known else [])]
+        ],
+    }
+
+
+@eqx.filter_jit
+def _plane(game: AbstractGame, V: CostSum, agent: Any, grid: Any) -> jax.Array:
+    """V [y, x] with one agent at (x, y) from its goal, facing along x."""
+    rest = at_target(game, game.reset(jax.random.key(0)))
+    if "psi" in game.dynamics.names:
+        rest = eqx.tree_at(lambda s: s.x, rest, rest.x.at[:, 2].set(0.0))
+
+    def at(x, y):
+        moved = rest.x.at[agent, :2].add(jnp.stack([x, y]))
+        return V.value(game, eqx.tree_at(lambda s: s.x, rest, moved))
+
+    row = lambda y: jax.vmap(lambda x: at(x, y))(jnp.asarray(grid))
+    return jax.lax.map(row, jnp.asarray(grid))

@@ -107,11 +107,31 @@ class Comparison(TypedDict, total=False):
 class Certificate(TypedDict, total=False):
     """One claim, and what stands behind it."""
 
-    claim: str
-    evidence: str
+    name: str
+    claim: str  # in words
+    evidence: str  # proved, statistical or observed
+    holds: bool
     bound: float | str
     confidence: float | str
+    scope: str  # start distribution, horizon, disturbance
     text: str
+
+
+class Contour(TypedDict, total=False):
+    """One level set in a slice."""
+
+    level: float
+    lines: Sequence[Any]  # each [[x, y], ...], m
+    certified: bool  # whether it is the level that was certified
+
+
+class Slice(TypedDict, total=False):
+    """V over the places of one agent relative to its goal, the others resting on theirs."""
+
+    label: str
+    reach: float  # m, half the side of the square that is shown
+    radius: float  # m, of success
+    contours: Sequence[Contour]
 
 
 class Page(TypedDict):
@@ -126,6 +146,7 @@ class Page(TypedDict):
     films: NotRequired[Sequence[Film]]
     comparisons: NotRequired[Sequence[Comparison]]
     certificates: NotRequired[Sequence[Certificate]]
+    slices: NotRequired[Sequence[Slice]]
     config: NotRequired[Mapping[str, Any]]
     versions: NotRequired[Mapping[str, str]]
     command: NotRequired[str]
@@ -157,7 +178,7 @@ def html(page: Page) -> str:
         "curves": _curves(page.get("runs") or ()),
         "starts": _starts(shown),
         "comparisons": _comparisons(page.get("comparisons") or ()),
-        "certificates": _certificates(page.get("certificates") or ()),
+        "certificates": _certificates(page.get("certificates") or (), page.get("slices") or ()),
         "making": _making(page),
         "films": _json([_film(scene) for scene in shown]),
     }
@@ -305,14 +326,74 @@ def _comparisons(comparisons: Sequence[Comparison]) -> str:
     return _section("Compared", _table(head, body, words=(0, 1, 5)), note)
 
 
-def _certificates(certificates: Sequence[Certificate]) -> str:
+def _certificates(certificates: Sequence[Certificate], slices: Sequence[Slice]) -> str:
+    """Each claim with its evidence and reach, then the level sets of V."""
     if not certificates:
         return ""
-    keys = ("evidence", "bound", "confidence", "text")
-    body = [_row(_text(c.get("claim")), [_any(c.get(k)) for k in keys]) for c in certificates]
-    head = ["Claim", "Evidence", "Bound", "Confidence", ""]
-    note = "What was checked, how, and how far it reaches."
-    return _section("Certificates", _table(head, body, words=(0, 1, 4)), note)
+    claims = "".join(_claim(c) for c in certificates)
+    note = (
+        "Each claim is about this policy, from starts of the kind stated and no others. "
+        "<b>Statistical</b>: shown on fresh starts, at the confidence stated. <b>Proved</b>: for "
+        "every state stated. <b>Observed</b>: seen, and no more. The worst case found for each is "
+        "among the films above."
+    )
+    figures = "".join(
+        _captioned(_slice(part), f"{_tag('b', 'V')} along {_text(part.get('label'))}")
+        for part in slices
+    )
+    charts = _tag("div", figures, cls="charts") if figures else ""
+    if figures:
+        words = (
+            "Level sets of V where one agent rests beside its goal, facing right, and all others "
+            "rest on theirs. The dashed line is the level that was certified, the ring the target."
+        )
+        charts = _tag("p", words, cls="note") + charts
+    return _section("Certificates", _tag("div", claims, cls="claims") + charts, note)
+
+
+def _claim(c: Certificate) -> str:
+    holds = c.get("holds")
+    mark = {True: ("holds", "holds"), False: ("fails", "does not hold")}.get(holds)  # type: ignore[arg-type]
+    verdict = _tag("span", mark[1], cls=f"mark {mark[0]}") if mark else ""
+    head = _tag("h3", _text(c.get("name") or "claim") + verdict)
+    facts = {key: c.get(key) for key in ("evidence", "bound", "confidence", "scope", "text")}
+    pairs = "".join(
+        _tag("div", _tag("dt", key) + _tag("dd", _any(value)))
+        for key, value in facts.items()
+        if value is not None
+    )
+    return _tag("article", head + _tag("p", _text(c.get("claim"))) + _tag("dl", pairs))
+
+
+def _slice(part: Slice) -> str:
+    """Contours in a square of 300 units."""
+    reach = _number(part.get("reach")) or 1.0
+    scale, body = 150 / reach, ""
+    for value in ticks(-reach, reach):
+        body += _grid_line(150 + value * scale, value, upright=True)
+        body += _grid_line(150 - value * scale, value, upright=False)
+    for contour in part.get("contours") or ():
+        kind = "contour certified" if contour.get("certified") else "contour"
+        for line in contour.get("lines") or ():
+            place = _array(line).reshape(-1, 2) * (scale, -scale) + 150
+            body += _tag("polyline", cls=kind, points=_points(*place.T))
+        body += _level(contour, scale)
+    radius = (_number(part.get("radius")) or 0.0) * scale
+    body += _tag("circle", cls="target", cx=150, cy=150, r=max(radius, 2.5))
+    return _svg(300, 300, body, f"level sets of V, {part.get('label') or ''}", "square")
+
+
+def _level(contour: Contour, scale: float) -> str:
+    """The value of a contour, written at its highest point if that is inside the picture."""
+    points = [point for line in contour.get("lines") or () for point in line]
+    level = _number(contour.get("level"))
+    if not points or level is None:
+        return ""
+    x, y = max(points, key=lambda point: point[1])
+    place = 150 + x * scale, 150 - y * scale
+    if place[1] < 12:
+        return ""
+    return _tag("text", f"{level:.3g}", x=place[0], y=place[1] - 3, text_anchor="middle")
 
 
 def _making(page: Page) -> str:
