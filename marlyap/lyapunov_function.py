@@ -14,6 +14,7 @@ from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.nets import LyapunovNet, NormNet
 from marlyap.rollout import Controller, rollout
+from marlyap.sensing import near
 from marlyap.types import Scalar, State, Trajectory
 
 
@@ -82,6 +83,50 @@ class Quadratic(AbstractLyapunov):
 
     def along(self, game, trajectory, time):
         return pointwise(self, game, trajectory, time)
+
+
+class Approach(AbstractLyapunov):
+    """V(s) = sum_i (1 + m) |e_i| - m e_i.h_i + |(g_v (v_i - v_d), g_w (w_i - w_d), eps)| - eps.
+
+    For unicycles, with e_i the way to the goal, h_i the heading, n_i its left normal, and
+
+        v_d = (k + k_near / (|e| + radius)) e.h,    w_d = k_turn e.n / (|e| + radius)
+
+    the speeds it would like. V is 0 exactly on the target set, at least |e_i| elsewhere, and
+    Lipschitz with a constant that its fields bound. By the second term an agent beside its goal has
+    something to gain from turning, without which V could not fall in every single step.
+    """
+
+    m: Scalar
+    k: Scalar  # 1/s
+    k_near: Scalar  # m/s
+    k_turn: Scalar  # rad/s
+    g_v: Scalar  # s
+    g_w: Scalar  # m s/rad
+    eps: Scalar  # m
+    ball: float = 0.0
+
+    @property
+    def beyond(self):
+        return 0
+
+    def value(self, game, state):
+        return jnp.sum(jax.vmap(lambda e: self.of(e, game.radius))(game.errors(state)))
+
+    def along(self, game, trajectory, time):
+        return pointwise(self, game, trajectory, time)
+
+    def of(self, errors: Float[Array, "4"], radius: float) -> Scalar:
+        """V of one agent with errors (e.h, e.n, v, w)."""
+        e, rates = errors[:2], errors[2:]
+        gap = jnp.stack([self.g_v, self.g_w]) * (rates - self.desired(e, radius))
+        slack = jnp.sqrt(jnp.sum(gap * gap) + self.eps**2) - self.eps
+        return (1 + self.m) * jnp.linalg.norm(e) - self.m * e[0] + slack
+
+    def desired(self, e: Float[Array, "2"], radius: float) -> Float[Array, "2"]:
+        """v_d (m/s) and w_d (rad/s)."""
+        towards = near(e, radius)
+        return jnp.stack([self.k * e[0] + self.k_near * towards[0], self.k_turn * towards[1]])
 
 
 class Norm(AbstractLyapunov):

@@ -17,7 +17,7 @@ from marlyap.certificates.composition import Composition, fit_row
 from marlyap.certificates.contraction import Contraction, failures_allowed
 from marlyap.certificates.decrease import Decrease
 from marlyap.certificates.linearisation import Linearisation
-from marlyap.certificates.proof import Loop, Proof, lyapunov
+from marlyap.certificates.proof import Loop, Proof, extents, lyapunov
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness
@@ -28,7 +28,7 @@ from marlyap.dynamics import AbstractDynamics, DoubleIntegrator, SingleIntegrato
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.identity import policy_hash
-from marlyap.lyapunov_function import CostSum, Norm, Quadratic
+from marlyap.lyapunov_function import Approach, CostSum, Norm, Quadratic
 from marlyap.nets import Actors, Greedy, NormNet, Shape
 from marlyap.perturb import Perturbed
 from marlyap.rollout import Decentralised
@@ -386,15 +386,39 @@ def test_a_proof_succeeds_resumes_and_refutes(tmp_path):
         short.check(*policy_of(-GAINS), FORM, 0)
 
 
-def test_the_bounds_of_the_unicycle_hold_at_random_points():
+APPROACH = Approach(
+    *map(jnp.asarray, (1.716, 0.743, 0.131, 3.284, 1.076, 0.439, 0.209))  # as experiments/proof.py
+)
+
+
+def test_approach_is_zero_on_the_target_and_at_least_the_distance_elsewhere():
+    e = jax.random.normal(jax.random.key(0), (1000, 4))
+    values = jax.vmap(lambda e: APPROACH.of(e, 0.1))(e)
+    assert float(APPROACH.of(jnp.zeros(4), 0.1)) == pytest.approx(0.0, abs=1e-7)
+    assert np.all(np.asarray(values) >= np.linalg.norm(e[:, :2], axis=1) - 1e-6)
+    assert float(APPROACH.of(jnp.array([0.0, 0.0, 1.0, 0.0]), 0.1)) > 0.5
+    wide = extents(APPROACH, np.array([1.0]), np.full(4, np.inf))[0]
+    assert float(APPROACH.of(jnp.array([0.0, 0.0, wide[2], 0.0]), 0.1)) == pytest.approx(
+        1, rel=1e-4
+    )
+
+
+def test_a_proof_says_by_when():
+    proof = dataclasses.replace(ANNULUS, c=1.0, rho=0.1, inner=0.2, eta=1e-9, decay=0.1)
+    assert proof.steps == int(np.ceil(np.log(10) / -np.log(0.9)))
+    assert dataclasses.replace(proof, eta=0.45, decay=0.0).steps == 2
+
+
+@pytest.mark.parametrize("kind", ["norm", "approach"])
+def test_the_bounds_of_the_unicycle_hold_at_random_points(kind):
     game = Rendezvous(agents=1)
     shape = Shape(1, 7, 6, 4, 2)
     controller = Decentralised(Greedy(Actors(shape, 32, key=jax.random.key(3))), game)
-    V = Norm(NormNet(shape, key=jax.random.key(1)))
+    V = Norm(NormNet(shape, key=jax.random.key(1))) if kind == "norm" else APPROACH
     rng = np.random.default_rng(0)
     centre, radius = rng.uniform(-1, 1, (500, 4)), rng.uniform(0, 0.2, (500, 4))
     box = bounds.box(centre, radius)
-    moved, V_of = Loop(game, controller)(box), lyapunov(V)
+    moved, V_of = Loop(game, controller)(box), lyapunov(V, game.radius)
     before, after = V_of(box), V_of(moved)
     change = bounds.add(after, before, -1.0)
 

@@ -1,10 +1,13 @@
 """C8: a proof for one leader in its reduced coordinates, by bounds on boxes that are split."""
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from rich.console import Console
+from rich.progress import Progress
 
 from marlyap import store
 from marlyap.certificate import AbstractCertificate, Evidence, Verdict
@@ -13,22 +16,23 @@ from marlyap.certificates.bounds import Affine
 from marlyap.dynamics import DoubleIntegrator, Unicycle
 from marlyap.errors import UserError
 from marlyap.identity import policy_hash
-from marlyap.lyapunov_function import Norm, Quadratic
+from marlyap.lyapunov_function import Approach, Norm, Quadratic
 
 
-Progress = Callable[[float, int], None]  # share of the volume that is settled, boxes left
+SAVE_EVERY = 10.0  # seconds
 
 
 class Proof(AbstractCertificate):
     """C8. One agent that knows its goal, x = (e_lon, e_lat, v, w), one step f of dt under mu:
 
-        f(x) lies in the box           for all x in the box |x_i| <= half_i with V(x) <= c,
-        V(f(x)) - V(x) <= -eta         for all x in the box with rho <= V(x) <= c,
-        V(f(x)) <= inner               for all x in the box with V(x) <= rho,
+        f(x) lies in the box                for all x in the box |x_i| <= half_i with V(x) <= c,
+        V(f(x)) <= (1 - decay) V(x) - eta   for all x in the box with rho <= V(x) <= c,
+        V(f(x)) <= inner                    for all x in the box with V(x) <= rho,
 
     with rho <= inner <= c. Then from every x in the box with V(x) <= c the inner set {V <= rho} is
-    reached within (c - rho) / eta steps, and {V <= inner} is never left again. It is a statement
-    about exact arithmetic; an eta well above 1e-5 leaves room for the controller's float32.
+    reached within (c - rho) / (eta + decay rho) steps, or log(c / rho) / -log(1 - decay) if that is
+    fewer, and {V <= inner} is never left again. It is a statement about exact arithmetic; an eta
+    well above 1e-5 leaves room for the controller's float32.
 
     Boxes are settled by affine bounds or split; the rounding of the bounds themselves is counted.
     The answer is proved, refuted with a state, or undecided with the volume that is left.
@@ -39,55 +43,71 @@ class Proof(AbstractCertificate):
     inner: float
     half: tuple[float, ...]  # the box is |x_i| <= half_i
     eta: float = 1e-4
-    most: int = 2_000_000  # boxes to look at before giving up
-    batch: int = 4096
+    decay: float = 0.0  # per step
+    most: int = 20_000_000  # boxes to look at before giving up
+    batch: int = 1024
     resume: str | None = None  # a directory that keeps what is left to do
-    on_progress: Progress | None = None
+    show: bool = False  # a progress bar
     confidence: float = 1.0
     evidence: ClassVar[Evidence] = "proved"
 
     def check(self, game, controller, V, seed):
-        loop, V_of = Loop(game, controller), lyapunov(V)
+        loop, V_of = Loop(game, controller), lyapunov(V, game.radius)
         todo, looked, settled = self.begin(controller, V)
         found, total = None, float(np.prod(2 * np.array(self.half)))
-        while len(todo) and looked < self.most and found is None:
-            now, todo = todo[-self.batch :], todo[: -self.batch]
-            keep, found = self.settle(now, loop, V_of)
-            looked += len(now)
-            settled += float(np.prod(2 * now[~keep, 1], axis=1).sum())
-            todo = np.concatenate([todo, halves(now[keep], np.array(self.half))])
-            self.progress(settled / total, todo, looked, settled, controller, V)
+        saved = time.monotonic()
+        with Progress(console=Console(stderr=True), disable=not self.show) as bar:
+            task = bar.add_task("proof", total=1.0)
+            while len(todo) and looked < self.most and found is None:
+                now, todo = todo[-self.batch :], todo[: -self.batch]
+                keep, level, found = self.settle(now, loop, V_of)
+                looked += len(now)
+                settled += float(np.prod(2 * now[~keep, 1], axis=1).sum())
+                wide = extents(V, np.clip(level, self.rho, self.c), np.array(self.half))
+                todo = np.concatenate([todo, halves(now[keep], wide)])
+                bar.update(task, completed=settled / total, description=f"{len(todo)} boxes left")
+                if time.monotonic() - saved > SAVE_EVERY:
+                    self.keep(todo, looked, settled, controller, V)
+                    saved = time.monotonic()
+        self.keep(todo, looked, settled, controller, V)
         left = 1.0 - settled / total if len(todo) else 0.0
         answer = "refuted" if found else "undecided" if len(todo) else "proved"
         return self.verdict(game, answer, found, looked, left, len(todo))
 
     def settle(
         self, now: np.ndarray, loop: "Loop", V_of: Callable[[Affine], Affine]
-    ) -> tuple[np.ndarray, dict[str, Any] | None]:
-        """Which boxes [k, 2, 4] (centre, radius) stay open; and a state that refutes, if any."""
-        V, after, change, moved = self.look(B.box(now[:, 0], now[:, 1]), loop, V_of)
+    ) -> tuple[np.ndarray, np.ndarray, dict[str, Any] | None]:
+        """Which boxes [k, 2, 4] (centre, radius) stay open, V there, and a state that refutes."""
+        near = np.flatnonzero(V_of(B.box(now[:, 0], now[:, 1])).low[:, 0] <= self.c)
+        some = now[near]
+        V, after, change, moved = self.look(B.box(some[:, 0], some[:, 1]), loop, V_of)
         falls = (change.high[:, 0] <= -self.eta) | (V.high[:, 0] < self.rho)
         stays = (after.high[:, 0] <= self.inner) | (V.low[:, 0] > self.rho)
         half = np.array(self.half)
         inside = ((moved.high <= half) & (moved.low >= -half)).all(axis=1)
-        keep = ~((V.low[:, 0] > self.c) | (falls & stays & inside))
-        point = B.box(now[keep, 0], np.zeros_like(now[keep, 1]))
+        keep = np.zeros(len(now), bool)
+        keep[near] = open_ = ~(falls & stays & inside)
+        # At the centre each quantity is b, give or take e: look closer where that may refute.
+        most = lambda y: (y.b + y.e)[:, 0]
+        suspect = (most(change) > -self.eta) | (most(after) > self.inner) | ~inside
+        level, suspect = V.b[open_, 0], some[open_ & suspect]
+        point = B.box(suspect[:, 0], np.zeros_like(suspect[:, 1]))
         V, after, change, moved = self.look(point, loop, V_of)
         rises = (V.low > self.rho) & (V.high < self.c) & (change.low > -self.eta)
         spills = (V.high < self.rho) & (after.low > self.inner)
         leaves = ((moved.low > half) | (moved.high < -half)).any(axis=1) & (V.high[:, 0] < self.c)
         bad = rises[:, 0] | spills[:, 0] | leaves
         if not bad.any():
-            return keep, None
+            return keep, level, None
         i = int(np.argmax(bad))
-        worst = {"x": now[keep, 0][i].tolist(), "V": float(V.b[i, 0])}
-        return keep, worst | {"V_next": float(after.b[i, 0]), "next": moved.b[i].tolist()}
+        worst = {"x": suspect[i, 0].tolist(), "V": float(V.b[i, 0])}
+        return keep, level, worst | {"V_next": float(after.b[i, 0]), "next": moved.b[i].tolist()}
 
     def look(self, x: Affine, loop: "Loop", V_of: Callable[[Affine], Affine]) -> tuple[Affine, ...]:
-        """V(x), V(f(x)), their difference, and f(x)."""
+        """V(x), V(f(x)), V(f(x)) - (1 - decay) V(x), and f(x)."""
         moved = loop(x)
         V, after = V_of(x), V_of(moved)
-        return V, after, B.add(after, V, -1.0), moved
+        return V, after, B.add(after, B.linear((1 - self.decay) * np.eye(1), V), -1.0), moved
 
     def begin(self, controller: Any, V: Any) -> tuple[np.ndarray, int, float]:
         """The whole box, or what an earlier run left of it."""
@@ -102,23 +122,30 @@ class Proof(AbstractCertificate):
             raise UserError(f"proof: {self.resume} belongs to another proof; choose another place.")
         return arrays["todo"], meta["looked"], meta["settled"]
 
-    def progress(self, share, todo, looked, settled, controller, V) -> None:
-        if self.on_progress is not None:
-            self.on_progress(share, len(todo))
+    def keep(self, todo, looked, settled, controller, V) -> None:
+        """Store what is left to do, where asked."""
         if self.resume is not None:
             meta = {"task": self.task(controller, V), "looked": looked, "settled": settled}
             store.write(Path(self.resume), "proof", {"todo": todo}, meta, replace=True)
 
     def task(self, controller: Any, V: Any) -> str:
         return f"{policy_hash(controller)} {policy_hash(V)} {self.c} {self.rho} {self.inner} " + (
-            f"{self.half} {self.eta}"
+            f"{self.half} {self.eta} {self.decay}"
         )
+
+    @property
+    def steps(self) -> int:
+        """In how many steps the inner set is reached from V = c at the latest."""
+        slow = (self.c - self.rho) / (self.eta + self.decay * self.rho)
+        fast = np.log(self.c / self.rho) / -np.log1p(-self.decay) if self.decay > 0 else np.inf
+        return int(np.ceil(min(slow, fast)))
 
     def verdict(self, game, answer, found, looked, left, boxes) -> Verdict:
         claim = (
-            f"{answer}: in one step of {game.dt:g} s V falls by at least {self.eta:g} from every "
-            f"state with {self.rho:g} <= V <= {self.c:g}, and {{V <= {self.inner:g}}} is not left "
-            f"from {{V <= {self.rho:g}}}"
+            f"{answer}: in one step of {game.dt:g} s V falls by {100 * self.decay:g} % and "
+            f"{self.eta:g} from every state with {self.rho:g} <= V <= {self.c:g}, so that "
+            f"{{V <= {self.rho:g}}} is entered within {self.steps} steps; and {{V <= "
+            f"{self.inner:g}}} is not left from there"
         )
         return Verdict(
             name="proof",
@@ -131,7 +158,8 @@ class Proof(AbstractCertificate):
             | {"disturbance": "none", "time": f"steps of {game.dt:g} s", "arithmetic": "exact"},
             worst=found,
             figures={"answer": answer, "boxes": looked, "left": boxes, "volume_left": left}
-            | {"c": self.c, "rho": self.rho, "inner": self.inner, "half": list(self.half)},
+            | {"c": self.c, "rho": self.rho, "inner": self.inner, "half": list(self.half)}
+            | {"decay": self.decay, "steps": self.steps, "seconds": self.steps * game.dt},
         )
 
 
@@ -165,20 +193,25 @@ class Loop:
         return B.join(new_lon, new_lat, rates)
 
     def policy(self, e: Affine, rates: Affine) -> Affine:
-        length = B.norm(B.join(e, B.constant(1e-6, e)))
-        inverse = B.reciprocal(B.add(length, B.constant(self.scale, e)))
-        near = B.join(B.product(e.pick([0]), inverse), B.product(e.pick([1]), inverse))
-        out = forward(self.layers, B.join(rates, B.constant(1.0, e), e, near))
-        return B.tanh(out.pick([0, 1]))
+        seen = B.join(rates, B.constant(1.0, e), e, magnified(e, self.scale))
+        return B.tanh(forward(self.layers, seen).pick([0, 1]))
 
 
-def lyapunov(V: Any) -> Callable[[Affine], Affine]:
+def magnified(e: Affine, scale: float) -> Affine:
+    """e / (|e| + scale), as `sensing.near`."""
+    inverse = B.reciprocal(B.add(B.norm(B.join(e, B.constant(1e-6, e))), B.constant(scale, e)))
+    return B.join(B.product(e.pick([0]), inverse), B.product(e.pick([1]), inverse))
+
+
+def lyapunov(V: Any, radius: float) -> Callable[[Affine], Affine]:
     """V over boxes of reduced states, which are `game.errors` of one agent."""
+    if isinstance(V, Approach):
+        return lambda x: approach(V, radius, x)
     if isinstance(V, Quadratic):
         P = np.asarray(V.P, float)
         return lambda x: B.quadratic((P + P.T) / 2, x)
     if not isinstance(V, Norm):
-        raise UserError(f"proof: V must be Norm or Quadratic, not {type(V).__name__}.")
+        raise UserError(f"proof: V must be Approach, Norm or Quadratic, not {type(V).__name__}.")
     layers, slope = weights(V.net.net, None), float(V.net.slope)
     zero = np.zeros((1, layers[0][0].shape[1]))
     at_zero = forward(layers, B.box(zero, zero))
@@ -189,6 +222,19 @@ def lyapunov(V: Any) -> Callable[[Affine], Affine]:
         return B.add(B.norm(Affine(y.A, b, e)), B.linear(slope * np.eye(1), B.norm(x)))
 
     return value
+
+
+def approach(V: Approach, radius: float, x: Affine) -> Affine:
+    m, g_v, g_w, eps = (float(a) for a in (V.m, V.g_v, V.g_w, V.eps))
+    e, near = x.pick([0, 1]), magnified(x.pick([0, 1]), radius)
+    desired = B.join(
+        B.linear(np.array([[float(V.k), 0.0, float(V.k_near), 0.0]]), B.join(e, near)),
+        B.linear(np.array([[0.0, float(V.k_turn)]]), near),
+    )
+    gap = B.linear(np.diag([g_v, g_w]), B.add(x.pick([2, 3]), desired, -1.0))
+    slack = B.norm(B.join(gap, B.constant(eps, x)))
+    ahead = B.linear(np.array([[1 + m, -m]]), B.join(B.norm(e), x.pick([0])), -eps)
+    return B.add(ahead, slack)
 
 
 def forward(layers: list[tuple[np.ndarray, np.ndarray]], x: Affine) -> Affine:
@@ -205,9 +251,22 @@ def weights(net: Any, agent: int | None) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(of(layer.weight), of(layer.bias)) for layer in net.layers]
 
 
-def halves(boxes: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Each box in two, across its relatively widest side, overlapping by a rounding."""
-    k, axis = np.arange(len(boxes)), np.argmax(boxes[:, 1] / half, axis=1)
+def extents(V: Any, level: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """About how far {V <= level} reaches along each coordinate [k, 4]: boxes are cut in that shape.
+
+    For a norm-like V that is another shape at every level, since eps does not shrink with it.
+    """
+    if not isinstance(V, Approach):
+        return np.broadcast_to(half, (len(level), 4))
+    gap = np.sqrt(level * (level + 2 * float(V.eps)))
+    near = level / (1 + float(V.m))
+    wide = np.stack([near, near, gap / float(V.g_v), gap / float(V.g_w)], axis=1)
+    return np.minimum(wide, half)
+
+
+def halves(boxes: np.ndarray, wide: np.ndarray) -> np.ndarray:
+    """Each box in two, across its widest side relative to `wide`, overlapping by a rounding."""
+    k, axis = np.arange(len(boxes)), np.argmax(boxes[:, 1] / wide, axis=1)
     left, right = boxes.copy(), boxes.copy()
     quarter = boxes[k, 1, axis] / 2
     left[k, 0, axis] -= quarter
