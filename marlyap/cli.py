@@ -74,6 +74,9 @@ def parser() -> Parser:
     p.add_argument("--algorithm", dest="own_algorithm", help=f"the algorithm, {own}")
     p.add_argument("--parallel", default="auto", help="seeds: auto, process (one a core) or vmap")
     p.add_argument("--device", default=None, help="cpu or gpu (default: what JAX finds)")
+    p.add_argument(
+        "--on-nan", default="stop", help="a number not finite: stop (default) or rollback"
+    )
     p.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
 
     p = verb("evaluate", "measure runs or hand-written controllers on fresh starts", OVERRIDES)
@@ -184,6 +187,8 @@ def prepare(args: Any) -> None:
         raise UserError(f"device: '{device}' must be cpu or gpu.")
     if getattr(args, "parallel", "auto") not in ("auto", "process", "vmap"):
         raise UserError(f"parallel: '{args.parallel}' must be auto, process or vmap.")
+    if getattr(args, "on_nan", "stop") not in ("stop", "rollback"):
+        raise UserError(f"on-nan: '{args.on_nan}' must be stop or rollback.")
     if device:
         os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": "cuda"}[device]
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_directory()))

@@ -1,10 +1,11 @@
 """The host loop over compiled iterations: progress, log, checkpoints, stopping in good order."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any
+from itertools import chain, groupby
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,6 +14,7 @@ import numpy as np
 
 from marlyap import store
 from marlyap.algorithm import AbstractAlgorithm
+from marlyap.diagnose import diagnose
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.nets import LyapunovNet, NormNet
@@ -29,27 +31,79 @@ class Diverged(UserError):
     """A number stopped being finite; the last checkpoint is sound."""
 
 
-def fit(runs: list[Run], stop: Callable[[], bool] = lambda: False) -> Iterator[dict[str, Any]]:
+def fit(
+    runs: list[Run], stop: Callable[[], bool] = lambda: False, attempts: int = 1
+) -> Iterator[dict[str, Any]]:
     """Train `runs` to the end, or until `stop()`; yields one dict for each run and iteration.
 
     Several runs must differ in their seed alone; they advance together under `vmap`. Everything
-    is saved at the end and when stopped, so that calling this again goes on bit for bit.
-    Raises Diverged (a UserError) when a number stops being finite in every run.
+    is saved at the end and when stopped, so that calling this again goes on bit for bit. A run in
+    which a number stops being finite is given up, the others go on; with more `attempts` it is
+    taken up again, from its last checkpoint and with other random numbers.
+    Raises Diverged (a UserError) if this was so in every run to the last.
     """
     with ExitStack() as held:
         for run in runs:
             held.enter_context(store.lock(run.directory))
             store.sweep(run.directory)
-        yield from _fit(runs, stop)
+        yield from _fit(runs, stop, attempts)
 
 
-def _fit(runs: list[Run], stop: Callable[[], bool]) -> Iterator[dict[str, Any]]:
-    trainer, loaded = runs[0].trainer, [run.load() for run in runs]
-    for run, (carry, _, warnings) in zip(runs, loaded, strict=True):
-        run.rewind(int(carry.iteration))
-        yield from ({"seed": run.seed, "warning": w} for w in warnings)
-    first = carry = _stack([carry for carry, _, _ in loaded])
-    before, clock = max(s for _, s, _ in loaded), time.monotonic()
+def _fit(runs: list[Run], stop: Callable[[], bool], attempts: int) -> Iterator[dict[str, Any]]:
+    """Train the runs that stand at the same iteration together, one such group after the other.
+
+    A damaged checkpoint or a fault may have thrown one run further back than the others.
+    """
+    faults: dict[int, Diverged] = {}
+    for attempt in range(attempts):
+        loaded = [_Loaded(run, *run.load()) for run in runs if not attempt or run.seed in faults]
+        for one in loaded:
+            one.run.rewind(one.iteration)
+            yield from ({"seed": one.run.seed, "warning": w} for w in one.warnings)
+        faults = {}
+        for _, group in groupby(sorted(loaded, key=_iteration), key=_iteration):
+            faults |= yield from _together([one.reseeded(attempt) for one in group], stop)
+        if not faults or stop():
+            break
+        if attempt + 1 < attempts:
+            told = f"going on from the last checkpoint with other random numbers ({attempt + 1})"
+            yield from ({"seed": seed, "warning": told} for seed in faults)
+    if len(faults) == len(runs):
+        raise next(iter(faults.values()))
+
+
+class _Loaded(NamedTuple):
+    """A run and what its newest sound checkpoint holds."""
+
+    run: Run
+    carry: Carry
+    seconds: float
+    warnings: tuple[str, ...]
+
+    @property
+    def iteration(self) -> int:
+        return int(self.carry.iteration)
+
+    def reseeded(self, attempt: int) -> "_Loaded":
+        """With other random numbers from here on, unless this is the first attempt."""
+        if not attempt:
+            return self
+        key = jax.random.fold_in(self.carry.key, attempt)
+        return self._replace(carry=eqx.tree_at(lambda c: c.key, self.carry, key))
+
+
+def _iteration(loaded: _Loaded) -> int:
+    return loaded.iteration
+
+
+def _together(
+    loaded: list[_Loaded], stop: Callable[[], bool]
+) -> Generator[dict[str, Any], None, dict[int, Diverged]]:
+    """Train runs that stand at the same iteration; returns why, for each seed that was given up."""
+    faults: dict[int, Diverged] = {}
+    runs, trainer = [one.run for one in loaded], loaded[0].run.trainer
+    first = carry = _stack([one.carry for one in loaded])
+    before, clock = max(one.seconds for one in loaded), time.monotonic()
     saved, alive = _Saved(clock), [True] * len(runs)
 
     for done, carry, rows in advance(trainer, first, stop):
@@ -59,15 +113,19 @@ def _fit(runs: list[Run], stop: Callable[[], bool]) -> Iterator[dict[str, Any]]:
             fault = _fault(line)
             if fault and alive[i]:
                 alive[i] = False
-                yield {"seed": run.seed, "iteration": done, "diverged": fault}
+                where = None if fault in FROM_TASK else diagnose(trainer, run.load()[0], done)
+                says = _advice(fault, line, trainer.game.agents, where) + f" in {run.directory}."
+                faults[run.seed] = Diverged(says)
+                yield {"seed": run.seed, "iteration": done, "diverged": fault, "says": says}
                 if not any(alive):
-                    raise Diverged(_advice(fault, line) + f" in {run.directory}.")
+                    return faults
             if alive[i]:
                 run.log(line)
                 yield line | {"iterations": trainer.iterations}
         if saved.due():
             saved.save(runs, carry, alive, seconds)
     saved.save(runs, carry, alive, before + time.monotonic() - clock)
+    return faults
 
 
 def advance(
@@ -123,7 +181,7 @@ def train(
     for done, carry, rows in advance(trainer, first):  # noqa: B007
         line = _line(trainer, seed, done, time.monotonic() - clock, rows, 0)
         if fault := _fault(line):
-            raise Diverged(_advice(fault, line) + ".")
+            raise Diverged(_advice(fault, line, game.agents) + ".")
         history.append(line)
         if on_iteration:
             on_iteration(line)
@@ -194,17 +252,21 @@ FROM_TASK = ("obs", "features", "reward", "cost")
 
 def _fault(line: dict[str, Any]) -> str | None:
     """What is not finite: what the task gave before what the algorithm made of it."""
-    for name in (*FROM_TASK, "action"):
-        if line.get(f"bad_{name}", 0) > 0:
+    for name in FROM_TASK:
+        if line.get(f"bad_{name}", -1) >= 0:
             return name
-    return next((k for k, v in line.items() if not np.isfinite(v)), None)
+    losses = (name for name, value in line.items() if not np.isfinite(value))
+    others = (name for name in ("action", "learner") if line.get(f"bad_{name}", -1) >= 0)
+    return next(chain(losses, others), None)
 
 
-def _advice(fault: str, line: dict[str, Any]) -> str:
+def _advice(fault: str, line: dict[str, Any], agents: int, where: str | None = None) -> str:
     by_task = fault in FROM_TASK
-    return (
-        f"{fault}: {'the task returned' if by_task else 'training made'} a number that is not "
-        f"finite in iteration {line['iteration']} (seed {line['seed']}); "
-        f"{'mend the task' if by_task else 'lower the learning rates'} and go on from the last "
-        "checkpoint"
-    )
+    text = f"{fault}: {'the task returned' if by_task else 'training made'} a number that is not "
+    text += f"finite in iteration {line['iteration']} (seed {line['seed']})"
+    if by_task:
+        step, agent = divmod(int(line[f"bad_{fault}"]), agents)
+        text += f", first for agent {agent} at step {step}"
+    text += f", first in {where}" if where else ""
+    mend = "mend the task" if by_task else "lower the learning rates"
+    return f"{text}; {mend} and go on from the last checkpoint"

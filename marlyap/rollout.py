@@ -6,7 +6,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from marlyap.game import AbstractGame
 from marlyap.types import Action, Key, Obs, State, Trajectory
@@ -95,3 +95,9 @@ def cost_to_go(
     padded = jnp.concatenate([cost, jnp.repeat(cost[-1:], missing, axis=0)])
     window = jnp.arange(time)[:, None] + jnp.arange(T)[None, :]
     return jnp.sum(padded[window], axis=1), padded[T : time + T]
+
+
+def first_fault(x: Float[Array, "episode time agent *rest"]) -> Int[Array, ""]:
+    """step * agents + agent of the first number that is not finite; -1 where all are."""
+    bad = jnp.any(~jnp.isfinite(x), axis=(0, *range(3, x.ndim)))
+    return jnp.where(jnp.any(bad), jnp.argmax(bad), -1)

@@ -27,7 +27,7 @@ from marlyap.algorithm import AbstractAlgorithm
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.nets import LyapunovNet, NormNet
-from marlyap.rollout import Decentralised, Policy
+from marlyap.rollout import Decentralised, Policy, first_fault
 from marlyap.trainer import Carry, Schedule, Trainer, shape
 
 
@@ -224,10 +224,12 @@ def begin(trainer: Trainer, seed: int) -> Carry:
     """The state of a fresh run. Raises UserError if the warm-up was not played in numbers."""
     carry = _begin(trainer, seeds.stream(seed, "train"))
     for name in ("obs", "features", "reward", "cost"):
-        if not bool(jnp.all(jnp.isfinite(getattr(carry.memory.episodes, name)))):
+        at = int(first_fault(getattr(carry.memory.episodes, name)))
+        if at >= 0:
+            step, agent = divmod(at, trainer.game.agents)
             raise UserError(
                 f"{name}: the task returned a number that is not finite in the warm-up "
-                f"(seed {seed}); mend the task."
+                f"(seed {seed}), first for agent {agent} at step {step}; mend the task."
             )
     return carry
 

@@ -1,5 +1,7 @@
 """The outer loop of Algorithms 1 and 2: play, remember, learn; compiled an iteration at a time."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,7 @@ from marlyap.rollout import (
     Policy,
     Uniform,
     cost_to_go,
+    first_fault,
     rollout,
 )
 from marlyap.seeds import stream
@@ -108,25 +111,41 @@ class Trainer(eqx.Module):
 
     def iterate(self, carry: Carry) -> tuple[Carry, dict[str, Scalar]]:
         """Play, remember, learn; the dict is for the log."""
+        return self.watched(carry, lambda learner: None)[:2]
+
+    def watched(
+        self, carry: Carry, watch: Callable[[PyTree], PyTree]
+    ) -> tuple[Carry, dict[str, Scalar], PyTree]:
+        """`iterate`, and what `watch` says of the learner after each update."""
         key, k_play, k_learn = jax.random.split(carry.key, 3)
         decay, memory, a = self.decay(carry.iteration), carry.memory, self.algorithm
         if isinstance(a, AbstractModelBased):
             keys = jax.random.split(k_play, self.schedule.environments)
             learner, info = a.improve(carry.learner, self.game, keys, decay)
+            seen = jax.tree.map(lambda x: x[None], watch(learner))
         else:
             assert isinstance(a, AbstractOffPolicy)
             new = self.play(a.explore(carry.learner), k_play, self.schedule.environments)
             memory = memory.add(new)
-            learner, info = self.learn(carry.learner, memory, k_learn, decay)
+            learner, info, seen = self.learn(carry.learner, memory, k_learn, decay, watch)
             info["return"] = jnp.mean(jnp.sum(jnp.mean(new.reward, axis=2), axis=1))
             for name in ("obs", "features", "action", "reward", "cost"):
-                info[f"bad_{name}"] = jnp.sum(~jnp.isfinite(getattr(new, name)))
+                info[f"bad_{name}"] = first_fault(getattr(new, name))
+        numbers = jax.tree.leaves(eqx.filter(learner, eqx.is_inexact_array))
+        # how many are not finite, less 1: negative where all is well, as above
+        bad = jnp.stack([jnp.sum(~jnp.isfinite(x)) for x in numbers])
+        info["bad_learner"] = jnp.sum(bad) - 1
         done = carry.iteration + 1
-        return Carry(learner, memory, key, done, carry.best, carry.score), info
+        return Carry(learner, memory, key, done, carry.best, carry.score), info, seen
 
     def learn(
-        self, learner: PyTree, memory: Replay, key: Key, decay: Scalar
-    ) -> tuple[PyTree, dict[str, Scalar]]:
+        self,
+        learner: PyTree,
+        memory: Replay,
+        key: Key,
+        decay: Scalar,
+        watch: Callable[[PyTree], PyTree],
+    ) -> tuple[PyTree, dict[str, Scalar], PyTree]:
         """An iteration's updates, each on a fresh batch from the memory."""
         a = self.algorithm
         assert isinstance(a, AbstractOffPolicy)
@@ -136,11 +155,11 @@ class Trainer(eqx.Module):
             k_sample, k_update = jax.random.split(key)
             batch = memory.sample(k_sample, a.batch, a.gamma, a.n_step)
             learner, info = a.update(eqx.combine(dynamic, static), batch, k_update, decay)
-            return eqx.filter(learner, eqx.is_array), info
+            return eqx.filter(learner, eqx.is_array), (info, watch(learner))
 
         keys = jax.random.split(key, self.updates_per_iteration)
-        dynamic, info = jax.lax.scan(one, dynamic, keys)
-        return eqx.combine(dynamic, static), jax.tree.map(jnp.mean, info)
+        dynamic, (info, seen) = jax.lax.scan(one, dynamic, keys)
+        return eqx.combine(dynamic, static), jax.tree.map(jnp.mean, info), seen
 
     def judge(self, carry: Carry) -> tuple[Carry, dict[str, Scalar]]:
         """Look at the policy from starts kept for this alone, and keep it if it is the best.
@@ -205,8 +224,8 @@ SCHEDULES = {
         decay_episodes=2_000,
         judge_every=50,
     ),
-    # 1,000 updates on 64 episodes each: playing is cheap where no critic is to be learnt.
-    "model-based": Schedule(steps=2_560_000, judge_every=50),
+    # 1,500 updates on 128 episodes each: playing is cheap where no critic is to be learnt.
+    "model-based": Schedule(steps=7_680_000, environments=128, judge_every=50),
 }
 
 

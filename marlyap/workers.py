@@ -20,6 +20,9 @@ from marlyap.fit import fit
 from marlyap.run import Run
 
 
+ATTEMPTS = 3  # at what is not finite, when it is to be rolled back
+
+
 class Stop:
     """Remembers the first signal, so that the loop ends in good order; the second ends at once."""
 
@@ -61,12 +64,13 @@ def train_all(runs: list[Run], args: Namespace) -> int:
     vmapped = args.parallel == "vmap" or (
         args.parallel == "auto" and jax.default_backend() != "cpu"
     )
+    attempts = ATTEMPTS if getattr(args, "on_nan", "stop") == "rollback" else 1
     with Stop() as stop:
         if args.worker:
-            for event in fit(runs, stop):
+            for event in fit(runs, stop, attempts):
                 print(json.dumps(event), flush=True)
         elif len(runs) == 1 or (vmapped and _alike(runs)):
-            _show(fit(runs, stop), runs)
+            _show(fit(runs, stop, attempts), runs)
         else:
             _show(_processes(runs, stop, args), runs)
     if stop.signal:
@@ -96,7 +100,7 @@ def _show(events: Iterable[dict[str, Any]], runs: list[Run]) -> None:
         seen: dict[int, dict[str, Any]] = {}
         for e in events:
             if "warning" in e or "diverged" in e:
-                what = e.get("warning") or f"{e['diverged']} is not finite; this seed is given up"
+                what = e.get("warning") or e["says"]
                 console.print(f"seed {e['seed']}: {what}", highlight=False)
                 continue
             first = seen.setdefault(e["seed"], e)
@@ -118,6 +122,7 @@ def _processes(runs: list[Run], stop: Stop, args: Namespace) -> Iterator[dict[st
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
     waiting, free, queue = list(runs), list(cores), Queue()
     active: dict[int, tuple[subprocess.Popen, int, Run]] = {}
+    failed: list[str] = []
     while (waiting and not stop()) or active:
         while waiting and free and not stop():
             run, core = waiting.pop(0), free.pop(0)
@@ -133,17 +138,18 @@ def _processes(runs: list[Run], stop: Stop, args: Namespace) -> Iterator[dict[st
         stop.children.remove(child)
         free.append(core)
         code = child.wait()
-        if code not in (0, 130, 143):
-            for other, _, _ in active.values():
-                other.send_signal(signal.SIGTERM)
+        if code not in (0, 130, 143):  # the other seeds go on
             said = child.stderr.read().strip().removeprefix("marlyap: ") if child.stderr else ""
-            raise UserError(said.splitlines()[-1] if said else f"{run.directory}: training failed.")
+            failed.append(said.splitlines()[-1] if said else f"{run.directory}: training failed.")
+    if failed:
+        raise UserError(failed[0])
 
 
 def _spawn(run: Run, core: int, args: Namespace) -> subprocess.Popen:
     names = [args.task, args.algorithm] if ":" in f"{args.task}{args.algorithm}" else []
     command = [sys.executable, "-m", "marlyap", "train", *names]
-    command += ["--worker", "--resume", str(run.directory)]
+    command += ["--worker", "--on-nan", getattr(args, "on_nan", "stop")]
+    command += ["--resume", str(run.directory)]
     return subprocess.Popen(
         command,
         env=os.environ | {"MARLYAP_CORE": str(core), "MARLYAP_WORKER": "1"},

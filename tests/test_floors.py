@@ -49,6 +49,7 @@ FLOORS = """
     config
     run
     marl_eval
+    diagnose
     fit
     workers
     film

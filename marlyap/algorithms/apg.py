@@ -28,7 +28,7 @@ from marlyap.errors import within
 from marlyap.game import AbstractGame
 from marlyap.learn import Learnt, polyak
 from marlyap.nets import Actors, Greedy
-from marlyap.rollout import Decentralised, rollout
+from marlyap.rollout import Decentralised, first_fault, rollout
 from marlyap.types import Key, Scalar
 
 
@@ -105,8 +105,8 @@ class APG(AbstractModelBased):
             "J_pi": loss,
             "gradient": norm,
             "return": jnp.mean(jnp.sum(jnp.mean(reward, axis=2), axis=1)),
-            "bad_cost": jnp.sum(~jnp.isfinite(cost)),
-            "bad_reward": jnp.sum(~jnp.isfinite(reward)),
+            "bad_cost": first_fault(cost),
+            "bad_reward": first_fault(reward),
         }
         return Learner(pi, polyak(pi.value, l.pi_mean, self.average)), info
 

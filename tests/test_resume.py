@@ -1,0 +1,571 @@
+"""Nothing is lost: a run that was stopped, killed or damaged ends as if nothing had happened."""
+
+import dataclasses
+import errno
+import importlib
+import itertools
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from argparse import Namespace
+from collections import deque
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from marlyap import store, workers
+from marlyap.algorithms import ALGORITHMS, MASAC
+from marlyap.cli import main
+from marlyap.dynamics import SingleIntegrator
+from marlyap.errors import UserError
+from marlyap.fit import Diverged, advance, fit
+from marlyap.rollout import first_fault
+from marlyap.run import Run, begin, flatten
+from marlyap.tasks import Rendezvous
+from marlyap.trainer import Schedule, Trainer
+
+
+FIT = importlib.import_module("marlyap.fit")
+NAMES = {"task": "rendezvous", "algorithm": "tiny", "preset": "tuned"}
+GAME = Rendezvous(agents=2, horizon=4, dynamics=SingleIntegrator())
+SCHEDULE = Schedule(
+    steps=48,  # six iterations
+    environments=2,
+    steps_per_update=4,
+    warmup=8,
+    capacity=40,  # ten episodes: full after four iterations, overwritten from the fifth
+    judge_every=4,
+    judge_episodes=4,
+)
+SINGLE, PAIR = (5,), (5, 6)
+
+
+def trainer(name, schedule=SCHEDULE):
+    small = dict(actor_width=4, critic_width=4, batch=4)
+    return Trainer(GAME, dataclasses.replace(ALGORITHMS[name], **small), schedule)
+
+
+def runs_in(place, name, seeds):
+    return [Run.create(place / f"seed{s}", trainer(name), s, NAMES) for s in seeds]
+
+
+def until(iterations):
+    """A `stop` that says so after this many iterations."""
+    asked = itertools.count()
+    return lambda: next(asked) >= iterations
+
+
+def final(run):
+    """All that a run leaves, the time it took apart: arrays, their meta, policy and log."""
+    saved, policy = run.checkpoints.latest(), store.read(run.directory / "policy", "policy")
+    log = [{k: v for k, v in line.items() if k != "seconds"} for line in run.history()]
+    return {
+        "step": saved.step,
+        "arrays": {k: (x.dtype, x.shape, x.tobytes()) for k, x in saved.arrays.items()},
+        "policy": {k: (x.dtype, x.shape, x.tobytes()) for k, x in policy[0].items()},
+        "about": policy[1],
+        "log": log,
+    }
+
+
+def contents(directory):
+    files = sorted(p for p in directory.rglob("*") if p.is_file() and p.name != ".lock")
+    return {str(p.relative_to(directory)): p.read_bytes() for p in files}
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    """What uninterrupted runs leave; each is trained when it is first asked for."""
+    known = {}
+
+    def of(name, seeds):
+        if (name, seeds) not in known:
+            runs = runs_in(tmp_path_factory.mktemp("whole"), name, seeds)
+            list(fit(runs))
+            known[name, seeds] = [final(run) for run in runs]
+        return known[name, seeds]
+
+    return of
+
+
+@pytest.fixture
+def eager(monkeypatch):
+    """A checkpoint after every iteration."""
+    monkeypatch.setattr(FIT, "PATIENCE", 0.0)
+    monkeypatch.setattr(FIT, "SHARE", 1e9)
+
+
+# --- Stopped and gone on with --------------------------------------------------------------------
+
+
+CUTS = {
+    "before the first iteration": [0],
+    "after the first iteration": [1],
+    "in mid run": [3],
+    "with the memory just full": [4],
+    "with the memory overwritten": [5],
+    "after each iteration": [1] * 5,
+    "at the end": [6],
+}
+
+
+@pytest.mark.parametrize("seeds", [SINGLE, PAIR], ids=["single", "vmapped pair"])
+@pytest.mark.parametrize("name", ["masac", "masac-lyapunov"])
+@pytest.mark.parametrize("cut", CUTS)
+def test_a_stopped_run_ends_bit_for_bit_like_an_uninterrupted_one(
+    cut, name, seeds, uninterrupted, tmp_path
+):
+    made = runs_in(tmp_path, name, seeds)
+    done = 0
+    for iterations in CUTS[cut]:
+        list(fit([Run.open(run.directory) for run in made], until(iterations)))
+        done += iterations
+        assert [run.checkpoints.latest().step for run in made] == [done] * len(seeds)
+    runs = [Run.open(run.directory) for run in made]
+    assert [run.finished for run in runs] == [done == 6] * len(seeds)
+    events = list(fit(runs))
+    assert [e["iteration"] for e in events if e["seed"] == 5] == [*range(done + 1, 7)]
+    for run, whole in zip(runs, uninterrupted(name, seeds), strict=True):
+        assert final(run) == whole
+        assert [line["iteration"] for line in run.history()] == [1, 2, 3, 4, 5, 6]
+        assert run.finished
+
+
+def test_the_whole_state_is_in_the_checkpoint(uninterrupted):
+    (whole,) = uninterrupted("masac-lyapunov", SINGLE)
+    parts = ("learner", "memory", "key", "iteration", "best", "score")
+    for part in parts:
+        assert any(key.startswith(f".{part}") for key in whole["arrays"]), part
+    assert {key.split(".")[1].split("[")[0] for key in whole["arrays"]} == {*parts}
+    assert all(len(part) for part in ("arrays", "policy", "log"))
+
+
+def test_seeds_differ_and_vmapping_changes_no_record(uninterrupted):
+    one, (a, b) = uninterrupted("masac", SINGLE)[0], uninterrupted("masac", PAIR)
+    assert a["arrays"].keys() == b["arrays"].keys() == one["arrays"].keys()
+    assert a["arrays"] != b["arrays"]
+    assert one["log"][0]["return"] == pytest.approx(a["log"][0]["return"], rel=1e-4)
+
+
+def test_every_kind_of_end_is_a_checkpoint(eager, uninterrupted, tmp_path):
+    (run,) = runs_in(tmp_path, "masac", SINGLE)
+    list(fit([run]))
+    assert run.checkpoints.steps() == [5, 6]
+    assert final(run) == uninterrupted("masac", SINGLE)[0]
+
+
+def test_a_generator_that_is_dropped_leaves_a_run_to_go_on_with(eager, uninterrupted, tmp_path):
+    (run,) = runs_in(tmp_path, "masac", SINGLE)
+    events = fit([run])
+    seen = [next(events) for _ in range(4)]
+    assert seen[-1]["iteration"] == 4
+    events.close()  # as a raised exception would; the fourth iteration is not yet saved
+    assert run.checkpoints.latest().step == 3
+    list(fit([run]))  # and the lock is free
+    assert final(run) == uninterrupted("masac", SINGLE)[0]
+
+
+# --- Damage --------------------------------------------------------------------------------------
+
+
+def spoil(run, step):
+    path = run.checkpoints.path(step) / store.PAYLOAD
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+
+
+def test_the_newest_checkpoint_damaged_costs_its_iterations_and_a_warning(uninterrupted, tmp_path):
+    (run,) = runs_in(tmp_path, "masac", SINGLE)
+    for _ in range(2):
+        list(fit([run], until(2)))
+    spoil(run, 4)
+    first, *events = fit([Run.open(run.directory)])
+    assert "Checkpoint 4 was passed over" in first["warning"] and first["seed"] == 5
+    assert [e["iteration"] for e in events] == [3, 4, 5, 6]
+    assert final(run) == uninterrupted("masac", SINGLE)[0]
+
+
+def test_all_checkpoints_damaged_is_refused_and_nothing_is_written(tmp_path):
+    (run,) = runs_in(tmp_path, "masac", SINGLE)
+    for _ in range(2):
+        list(fit([run], until(2)))
+    spoil(run, 2)
+    spoil(run, 4)
+    before = contents(run.directory)
+    with pytest.raises(UserError, match="no checkpoint to load"):
+        list(fit([Run.open(run.directory)]))
+    assert contents(run.directory) == before
+
+
+def test_one_of_a_pair_falling_back_does_not_mislead_the_other(uninterrupted, tmp_path):
+    runs = runs_in(tmp_path, "masac", PAIR)
+    for _ in range(2):
+        list(fit(runs, until(2)))
+    spoil(runs[1], 4)
+    events = list(fit([Run.open(run.directory) for run in runs]))
+    assert [e["iteration"] for e in events if e["seed"] == 5] == [5, 6]
+    assert [e["iteration"] for e in events[1:] if e["seed"] == 6] == [3, 4, 5, 6]
+    for run, whole in zip(runs, uninterrupted("masac", PAIR), strict=True):
+        assert run.checkpoints.latest().step == 6
+        assert [line["iteration"] for line in run.history()] == [1, 2, 3, 4, 5, 6]
+        assert final(run)["step"] == whole["step"]
+
+
+def test_a_log_ahead_of_the_checkpoint_or_cut_short_is_mended(uninterrupted, tmp_path):
+    (run,) = runs_in(tmp_path, "masac", SINGLE)
+    list(fit([run], until(3)))
+    with open(run.directory / "log.jsonl", "a") as file:  # as a kill leaves it
+        file.write('{"iteration": 4, "seed": 5}\n{"iteration": 5, "se')
+    list(fit([Run.open(run.directory)]))
+    assert final(run) == uninterrupted("masac", SINGLE)[0]
+
+
+def test_a_directory_that_vanishes_in_mid_run_is_said(tmp_path):
+    (run,) = runs_in(tmp_path, "masac", SINGLE)
+    events = fit([run])
+    next(events)
+    shutil.rmtree(run.directory)
+    with pytest.raises(UserError, match="could not be written .*; make sure"):
+        list(events)
+    assert not run.directory.exists()
+
+
+def test_a_disk_that_fills_up_costs_what_was_not_saved(uninterrupted, tmp_path, monkeypatch):
+    (run,) = runs_in(tmp_path, "masac", SINGLE)
+    list(fit([run], until(2)))
+    write = store._write_file
+
+    def full(path, chunks):
+        if path.name == store.PAYLOAD:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(path, chunks)
+
+    monkeypatch.setattr(store, "_write_file", full)
+    with pytest.raises(UserError, match="No space left on device.*; free some disk space"):
+        list(fit([run]))
+    monkeypatch.undo()
+    assert run.checkpoints.latest().step == 2 and run.checkpoints.steps() == [2]
+    list(fit([run]))
+    assert final(run) == uninterrupted("masac", SINGLE)[0]
+
+
+@pytest.mark.parametrize("field, value", [("actor_width", 5), ("batch", 4.5)])
+def test_a_checkpoint_of_another_config_is_refused(field, value, tmp_path):
+    (run,) = runs_in(tmp_path, "masac", SINGLE)
+    list(fit([run], until(1)))
+    about = json.loads((run.directory / "run.json").read_text())
+    about["algorithm"][field] = value
+    (run.directory / "run.json").write_text(json.dumps(about))
+    with pytest.raises(UserError):
+        list(fit([Run.open(run.directory)]))
+    assert run.checkpoints.steps() == [1]
+
+
+# --- Numbers that are not finite -----------------------------------------------------------------
+
+
+def poison(monkeypatch, seeds):
+    """Give the runs of these seeds a temperature that is not a number when they are loaded."""
+    load = Run.load
+
+    def poisoned(self):
+        carry, seconds, warnings = load(self)
+        if self.seed in seeds:
+            nan = jnp.full((), jnp.nan, jnp.float32)
+            carry = eqx.tree_at(lambda c: c.learner.log_alpha.value, carry, nan)
+        return carry, seconds, warnings
+
+    monkeypatch.setattr(Run, "load", poisoned)
+
+
+def test_a_diverged_seed_does_not_touch_its_neighbour(uninterrupted, tmp_path, monkeypatch):
+    runs = runs_in(tmp_path, "masac", PAIR)
+    list(fit(runs, until(2)))
+    before = contents(runs[1].directory)
+    poison(monkeypatch, {6})
+    events = list(fit(runs))
+    (fault,) = [e for e in events if "diverged" in e]
+    assert (fault["seed"], fault["iteration"]) == (6, 3)
+    assert fault["diverged"] in ("J_Q", "J_pi", "alpha")
+    assert re.search(r"\(seed 6\), first in the .* in update 1 of iteration 3;", fault["says"])
+    assert [(e["seed"], e["iteration"]) for e in events if e is not fault] == [
+        (5, 3),
+        (5, 4),
+        (5, 5),
+        (5, 6),
+    ]
+    assert final(runs[0]) == uninterrupted("masac", PAIR)[0]
+    assert contents(runs[1].directory) == before and not runs[1].finished
+
+    monkeypatch.undo()  # what was saved is sound, so the fallen seed can be gone on with
+    list(fit([Run.open(runs[1].directory)]))
+    assert runs[1].checkpoints.latest().step == 6
+
+
+def test_when_all_diverge_training_stops_and_the_checkpoints_stay(tmp_path, monkeypatch):
+    runs = runs_in(tmp_path, "masac", PAIR)
+    list(fit(runs, until(2)))
+    before = [contents(run.directory) for run in runs]
+    poison(monkeypatch, {5, 6})
+    events = []
+    with pytest.raises(Diverged, match=r"iteration 3 \(seed \d\).*lower the learning rates"):
+        for event in fit(runs):
+            events.append(event)
+    assert [e["seed"] for e in events] == [5, 6]
+    assert [contents(run.directory) for run in runs] == before
+
+
+def test_a_run_rolls_back_and_tries_other_random_numbers(uninterrupted, tmp_path, monkeypatch):
+    (run,) = runs_in(tmp_path, "masac", SINGLE)
+    list(fit([run], until(2)))
+    sound, loads = Run.load, itertools.count()
+    poison(monkeypatch, {5})
+    bad = Run.load
+    monkeypatch.setattr(Run, "load", lambda run: (sound if next(loads) else bad)(run))
+    events = list(fit([run], attempts=2))
+    assert [e.get("iteration") for e in events] == [3, None, 3, 4, 5, 6]
+    assert "diverged" in events[0] and "with other random numbers" in events[1]["warning"]
+    assert [line["iteration"] for line in run.history()] == [1, 2, 3, 4, 5, 6]
+    found, whole = final(run), uninterrupted("masac", SINGLE)[0]
+    assert found["log"][:2] == whole["log"][:2] and found["log"][2] != whole["log"][2]
+    assert all(np.isfinite(line["J_Q"]) for line in found["log"])
+
+
+def test_what_fails_every_time_is_given_up(tmp_path, monkeypatch):
+    (run,) = runs_in(tmp_path, "masac", SINGLE)
+    list(fit([run], until(2)))
+    before = contents(run.directory)
+    poison(monkeypatch, {5})
+    with pytest.raises(Diverged, match="lower the learning rates"):
+        list(fit([run], attempts=3))
+    assert contents(run.directory) == before
+
+
+class Faulty(MASAC):
+    """In the third update the bias of agent 1 becomes infinite: as an overflow would have it."""
+
+    def update(self, learner, b, key, decay):
+        learner, info = super().update(learner, b, key, decay)
+        bias = lambda l: l.pi.value.net.layers[1].bias
+        third = learner.pi.memory.count == 3
+        value = bias(learner).at[1, 2].add(jnp.where(third, jnp.inf, 0.0))
+        return eqx.tree_at(bias, learner, value), info
+
+
+def test_the_array_the_agent_and_the_update_are_named(tmp_path):
+    small = trainer("masac").algorithm
+    algorithm = Faulty(actor_width=4, critic_width=4, batch=4, constraint=small.constraint)
+    run = Run.create(tmp_path / "seed5", Trainer(GAME, algorithm, SCHEDULE), 5, NAMES)
+    says = (
+        r"\(seed 5\), first in the parameter pi\.net\.layers\[1\]\.bias of agent 1 "
+        r"in update 1 of iteration 2; lower the learning rates"
+    )
+    with pytest.raises(Diverged, match=says):
+        list(fit([run]))
+
+
+class Holed(Rendezvous):
+    def rewards(self, state, action):
+        hole = (state.t == 2) & (jnp.arange(self.agents) == 1)
+        return jnp.where(hole, jnp.nan, super().rewards(state, action))
+
+
+def test_the_agent_and_the_step_of_a_bad_reward_are_named():
+    game = Holed(agents=2, horizon=4, dynamics=SingleIntegrator())
+    says = r"reward: .* in the warm-up \(seed 0\), first for agent 1 at step 2; mend the task"
+    with pytest.raises(UserError, match=says):
+        begin(Trainer(game, trainer("masac").algorithm, SCHEDULE), 0)
+    line = {f"bad_{name}": -1.0 for name in ("obs", "features", "cost", "action", "learner")}
+    line |= {"seed": 0, "iteration": 7, "J_Q": np.nan, "bad_reward": 5.0}
+    assert FIT._fault(line) == "reward"
+    says = FIT._advice("reward", line, 2)
+    assert "in iteration 7 (seed 0), first for agent 1 at step 2; mend the task" in says
+    line["bad_reward"] = -1.0
+    assert FIT._fault(line) == "J_Q"
+    line["J_Q"] = 0.0
+    assert FIT._fault(line) is None
+    line["bad_learner"] = 0.0
+    assert FIT._fault(line) == "learner"
+    assert "training made" in FIT._advice("learner", line, 2)
+
+
+def test_the_first_fault_of_an_episode():
+    x = np.zeros((3, 4, 2, 5), np.float32)
+    assert int(first_fault(x)) == -1
+    x[2, 3, 0, 1], x[0, 3, 1, 4], x[1, 2, 1, 0] = np.nan, np.inf, -np.inf
+    assert divmod(int(first_fault(x)), 2) == (2, 1)
+
+
+def test_a_process_that_fails_leaves_the_other_seeds_alone(tmp_path, monkeypatch):
+    """Seed 5 ends at once with an error, seed 6 goes on; then the error is told."""
+    runs = runs_in(tmp_path, "masac", PAIR)
+    work = "import time; time.sleep(0.5); print('{\"seed\": 6}')"
+    fail = "import sys; sys.exit('marlyap: J_Q: it diverged.')"
+
+    def spawn(run, core, args):
+        code = fail if run.seed == 5 else work
+        pipe = subprocess.PIPE
+        return subprocess.Popen([sys.executable, "-c", code], stdout=pipe, stderr=pipe, text=True)
+
+    monkeypatch.setattr(workers, "_spawn", spawn)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    events = []
+    with pytest.raises(UserError, match="^J_Q: it diverged.$"):
+        for event in workers._processes(runs, workers.Stop(), Namespace()):
+            events.append(event)
+    assert events == [{"seed": 6}]
+
+
+# --- Two at once, signals and kills --------------------------------------------------------------
+
+
+def test_a_run_in_use_is_refused(tmp_path):
+    (run,) = runs_in(tmp_path, "masac", SINGLE)
+    before = contents(run.directory)
+    with store.lock(run.directory):
+        with pytest.raises(UserError, match=f"in use by process {os.getpid()}"):
+            next(fit([run]))
+    assert contents(run.directory) == before
+
+
+def test_a_pair_is_refused_when_one_of_them_is_in_use(tmp_path):
+    a, b = runs_in(tmp_path, "masac", PAIR)
+    with store.lock(b.directory), pytest.raises(UserError, match="in use"):
+        next(fit([a, b]))
+    with store.lock(a.directory):  # was given back
+        pass
+
+
+ENDLESS = dataclasses.replace(SCHEDULE, steps=10**9, judge_every=10**9)
+EAGER = """
+import sys
+import marlyap.fit as f
+f.PATIENCE, f.SHARE = 0.0, 1e9
+from marlyap.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+class Child:
+    """A training process that goes on with `run`."""
+
+    def __init__(self, run, *python):
+        self.run, self.says = run, run.directory.parent / f"{time.monotonic_ns()}.txt"
+        self.lines = len(run.history())
+        self.log = run.directory / "log.jsonl"
+        env = os.environ | {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1"}
+        command = [*(python or ["-m", "marlyap"]), "train", "--resume", str(run.directory)]
+        with open(self.says, "w") as file:
+            self.process = subprocess.Popen(
+                [sys.executable, *command],
+                stdout=file,
+                stderr=file,
+                env={k: v for k, v in env.items() if not k.startswith("MARLYAP")},
+                start_new_session=True,
+            )
+
+    def until_it_trains(self):
+        deadline = time.monotonic() + 400
+        while not self.log.is_file() or self.log.read_bytes().count(b"\n") < self.lines + 3:
+            assert self.process.poll() is None, self.says.read_text()
+            assert time.monotonic() < deadline, "it does not train"
+            time.sleep(0.02)
+
+    def end(self, *signals):
+        for number in signals:
+            self.process.send_signal(number)
+        code = self.process.wait(120)
+        return code, self.says.read_text()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+
+
+@pytest.mark.slow
+def test_signals_and_kills_lose_nothing(tmp_path, capsys):
+    endless = trainer("masac", ENDLESS)
+    run = Run.create(tmp_path / "seed5", endless, 5, NAMES)
+
+    with Child(run) as child:
+        child.until_it_trains()
+        capsys.readouterr()
+        assert main(["train", "--resume", str(run.directory)]) == 2  # a second trainer
+        assert f"in use by process {child.process.pid}" in capsys.readouterr().err
+        code, said = child.end(signal.SIGINT)
+    assert code == 130 and "Traceback" not in said
+    assert f"marlyap train --resume {run.directory}" in said
+    first = run.checkpoints.latest()
+    assert first.step == len(run.history()) >= 3 and first.warnings == ()
+
+    with Child(run) as child:
+        child.until_it_trains()
+        code, said = child.end(signal.SIGTERM)
+    assert code == 143 and f"marlyap train --resume {run.directory}" in said
+    second = run.checkpoints.latest()
+    assert second.step == len(run.history()) > first.step
+
+    with Child(run) as child:
+        child.until_it_trains()
+        code, said = child.end(signal.SIGINT, signal.SIGINT)
+    assert code == 130 and "Traceback" not in said
+    third = run.checkpoints.latest()
+    assert third.step >= second.step and third.warnings == ()
+
+    with Child(run, "-c", EAGER) as child:  # saves all the time, so the kill falls into a save
+        child.until_it_trains()
+        code, said = child.end(signal.SIGKILL)
+    assert code == -signal.SIGKILL and "Traceback" not in said
+    carry, _, warnings = Run.open(run.directory).load()
+    assert int(carry.iteration) > third.step and warnings == ()
+
+    list(fit([run], lambda: True))  # opens it, cleans up, saves
+    names = [p.name for p in run.directory.rglob("*")]
+    assert not [n for n in names if n.endswith((".tmp", ".old"))]
+    assert len(run.history()) == int(carry.iteration)
+
+    # four processes on, it is where one that was never stopped would be
+    stack = lambda x: x[None] if eqx.is_array(x) else x
+    way = advance(endless, jax.tree.map(stack, begin(endless, 5)), until(int(carry.iteration)))
+    done, expected, _ = deque(way, maxlen=1).pop()
+    one = flatten(jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, expected))
+    found = run.checkpoints.latest()
+    assert found.step == done and found.arrays.keys() == one.keys()
+    for key, value in one.items():
+        np.testing.assert_array_equal(found.arrays[key], value, err_msg=key, strict=True)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["INT", "TERM"])
+def test_what_is_stopped_says_how_to_go_on(number, tmp_path, capsys, monkeypatch):
+    """The first signal is remembered until the end of the iteration; the handler is put back."""
+    (run,) = runs_in(tmp_path, "masac", SINGLE)
+    line, before = Run.log, signal.getsignal(number)
+
+    def interrupted(self, entry):
+        line(self, entry)
+        if entry["iteration"] == 2:
+            os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(Run, "log", interrupted)
+    assert main(["train", "--resume", str(run.directory), "--json"]) == 128 + number
+    said = capsys.readouterr()
+    assert f"Go on with: marlyap train --resume {run.directory}" in said.err
+    assert "Stopping at the next checkpoint; once more to stop at once." in said.err
+    state = {"run": str(run.directory), "seed": 5, "steps": 16, "finished": False}
+    assert json.loads(said.out) == {"runs": [state]}
+    assert signal.getsignal(number) == before
+    assert Path(run.checkpoints.path(2)).is_dir()
