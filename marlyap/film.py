@@ -127,11 +127,11 @@ def strip(game: AbstractGame, path: Trajectory, lyapunov: jax.Array | None) -> d
     linked = np.asarray(jax.vmap(game.linked)(state))
     distance = np.asarray(jax.vmap(game.distance)(state)).max(axis=1)
     edges = [[[int(i), int(j)] for i, j in np.argwhere(np.triu(a))] for a in linked]
-    cost = np.asarray(path.cost).mean(axis=1)
+    cost, goals = np.asarray(path.cost).mean(axis=1), np.asarray(state.goal[0])
     return {
         "dt": game.dt,
         "radius": game.radius,
-        "target": np.asarray(state.goal[0]).tolist(),
+        "target": (goals[0] if (goals == goals[0]).all() else goals).tolist(),
         "positions": np.asarray(jax.vmap(game.positions)(state)).tolist(),
         "headings": headings,
         "leaders": [bool(x) for x in game.leads],
