@@ -138,7 +138,11 @@ def _processes(runs: list[Run], stop: Stop, args: Namespace) -> Iterator[dict[st
         stop.children.remove(child)
         free.append(core)
         code = child.wait()
-        if code not in (0, 130, 143):  # the other seeds go on
+        if code in (130, 143) and not stop():
+            failed.append(
+                f"{run.directory}: its process was stopped from outside; go on with train --resume."
+            )
+        elif code not in (0, 130, 143):  # the other seeds go on
             said = child.stderr.read().strip().removeprefix("marlyap: ") if child.stderr else ""
             failed.append(said.splitlines()[-1] if said else f"{run.directory}: training failed.")
     if failed:

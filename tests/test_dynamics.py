@@ -192,11 +192,11 @@ def test_the_lipschitz_constant_in_the_action():
 
 
 def test_bad_parameters_are_named():
-    with pytest.raises(UserError, match="dynamics.limits.*2 positive"):
+    with pytest.raises(UserError, match="limits.*2 positive"):
         Unicycle(limits=(1.0, 0.0))
-    with pytest.raises(UserError, match="dynamics.limits"):
+    with pytest.raises(UserError, match="limits"):
         DoubleIntegrator(limits=(1.0,))
-    with pytest.raises(UserError, match="dynamics.limits"):
+    with pytest.raises(UserError, match="limits"):
         SingleIntegrator(limits=(float("nan"), 1.0))
     with pytest.raises(Exception, match="integrator"):
         Unicycle(integrator="heun")
