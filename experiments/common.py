@@ -149,7 +149,9 @@ def fill(name: str, cases: Sequence[Case], args: argparse.Namespace) -> None:
         about = case.about | {"seed": seed}
         final, contracts = measure(run.game, run.controller(), args.episodes)
         kept = ("steps", "updates", "success", "return")
-        curves = [about | {k: line.get(k, "") for k in kept} for line in run.history()]
+        history = run.history()
+        looks = [line for line in history if "success" in line or len(history) <= 200]
+        curves = [about | {k: line.get(k, "") for k in kept} for line in looks]
         put(args, f"{name}-curves", columns, curves)
         fall = about | {"T": T, "beta": BETA} | counted(contracts)
         put(args, f"{name}-contraction", columns, [fall])
