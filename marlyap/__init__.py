@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 
 if TYPE_CHECKING:
-    from marlyap.algorithms import MASAC as MASAC
+    from marlyap.algorithms import APG as APG, MASAC as MASAC
     from marlyap.constraints import Lyapunov as Lyapunov, Unconstrained as Unconstrained
     from marlyap.dynamics import (
         DoubleIntegrator as DoubleIntegrator,
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from marlyap.types import State as State
 
 PUBLIC = {
-    "algorithms": ("MASAC",),
+    "algorithms": ("APG", "MASAC"),
     "constraints": ("Lyapunov", "Unconstrained"),
     "dynamics": ("DoubleIntegrator", "SingleIntegrator", "Unicycle"),
     "errors": ("UserError",),

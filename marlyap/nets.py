@@ -22,6 +22,9 @@ class Shape(NamedTuple):
     du: int
 
 
+EPS = 1e-5  # of LayerNorm
+
+
 class Layer(eqx.Module):
     """x -> W x + b, initialised uniformly in +- 1/sqrt(in); then LayerNorm's gain and offset."""
 
@@ -42,9 +45,14 @@ class Layer(eqx.Module):
         # The mean over outputs that LayerNorm subtracts is linear in W and b: take it there.
         centred = lambda a, axis: a - jnp.mean(a, axis=axis, keepdims=True)
         y = matmul(centred(self.weight, -2), x) + centred(self.bias, -1)[..., None]
-        scale = jax.lax.rsqrt(jnp.mean(y * y, axis=-2, keepdims=True) + 1e-5)
+        scale = jax.lax.rsqrt(jnp.mean(y * y, axis=-2, keepdims=True) + EPS)
         gain, offset = self.norm
         return y * scale * gain[..., None] + offset[..., None]
+
+    def lipschitz(self) -> Scalar:
+        """An upper bound: the spectral norm of W, and what LayerNorm may stretch next to 0."""
+        norm = jnp.linalg.norm(self.weight, ord=2)
+        return norm if self.norm is None else norm * jnp.max(jnp.abs(self.norm[0])) / EPS**0.5
 
 
 class MLP(eqx.Module):
@@ -229,7 +237,7 @@ class NormNet(eqx.Module):
     """V(s) = ||Phi(e) - Phi(0)|| + slope ||e||, where e is zero exactly on the target set.
 
     So V is 0 on the target set, positive elsewhere whatever the weights, and its Lipschitz
-    constant in e is at most the product of the layers' spectral norms plus `slope`.
+    constant in e is at most the product of the layers' constants plus `slope`.
     """
 
     net: MLP
@@ -243,13 +251,13 @@ class NormNet(eqx.Module):
     def __call__(self, features: Features, action: Action | None = None) -> Scalar:
         e = features[:, : self.errors].ravel()
         at_zero = _forward(self.net, jnp.zeros((e.shape[0], 1)))[:, 0]  # one for the whole batch
-        change = self.net(e) - at_zero
+        change = jnp.where(jnp.any(e != 0), self.net(e) - at_zero, 0.0)  # 0 to the last bit at 0
         return _norm(change) + self.slope * _norm(e)
 
     def lipschitz(self) -> Scalar:
         """An upper bound on |V(s) - V(s')| / ||e - e'||."""
-        norms = [jnp.linalg.norm(layer.weight, ord=2) for layer in self.net.layers]
-        return jnp.prod(jnp.stack(norms)) + self.slope
+        bounds = [layer.lipschitz() for layer in self.net.layers]
+        return jnp.prod(jnp.stack(bounds)) + self.slope
 
 
 def _norm(x: Float[Array, "n"]) -> Scalar:

@@ -33,7 +33,10 @@ def benchmarks(monkeypatch):
     return lambda name: runpy.run_path(str(FOLDER / f"{name}.py"))
 
 
-@pytest.mark.parametrize("name", ["agents", "environment", "peer", "startup", "update"])
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("agents", "peer", "startup")]
+
+
+@pytest.mark.parametrize("name", ["environment", "update", *SLOW])
 @pytest.mark.usefixtures("quick_compilation")
 def test_quick(name, benchmarks, tmp_path, capsys):
     benchmarks(name)["main"](["--quick", "--out", str(tmp_path)])
