@@ -15,6 +15,7 @@ from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State
 
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
 LAWS = [name for name in CONTROLLERS if name != "optimal-control"]
 every_law = pytest.mark.parametrize("name", LAWS)
 PATH = Rendezvous(agents=5, graph="path")

@@ -21,7 +21,10 @@ SCRIPTS = {
     "sizes": ["algorithm", "agents", "graph", "leaders", "budget"],
 }
 pytestmark = pytest.mark.usefixtures("quick_compilation")
-every_script = pytest.mark.parametrize("name", SCRIPTS)
+slow = pytest.mark.slow
+every_script = pytest.mark.parametrize(
+    "name", ["headline", *(pytest.param(name, marks=slow) for name in list(SCRIPTS)[1:])]
+)
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +91,7 @@ def test_the_quick_form(name, script, places, monkeypatch, capsys):
     assert picture.exists() and "interquartile mean" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_row_that_is_lost_is_made_again(script, places):
     """Runs are random by their seed alone: the same row comes back."""
     name = "headline-rendezvous-success"
@@ -103,6 +107,7 @@ def test_a_row_that_is_lost_is_made_again(script, places):
     assert order(table(places, name)) == order(whole)
 
 
+@pytest.mark.slow
 def test_robustness(script, places):
     script("robustness", "--quick", "--seeds", "0", "1")
     rows = table(places, "robustness-rendezvous")

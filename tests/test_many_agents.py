@@ -110,7 +110,7 @@ def run(tmp_path_factory):
     return run
 
 
-@pytest.mark.parametrize("agents", [2, 5])
+@pytest.mark.parametrize("agents", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_a_policy_runs_with_another_number_of_agents(run, agents):
     """What an agent does depends on what it sees alone, not on how many others there are."""
     game = replace(run.game, agents=agents)

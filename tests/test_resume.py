@@ -119,7 +119,7 @@ CUTS = {
 
 
 @pytest.mark.parametrize("seeds", [SINGLE, PAIR], ids=["single", "vmapped pair"])
-@pytest.mark.parametrize("name", ["masac", "masac-lyapunov"])
+@pytest.mark.parametrize("name", ["masac-lyapunov", pytest.param("masac", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("cut", CUTS)
 def test_a_stopped_run_ends_bit_for_bit_like_an_uninterrupted_one(
     cut, name, seeds, uninterrupted, tmp_path

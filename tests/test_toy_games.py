@@ -118,7 +118,11 @@ def look(trainer, learner):
     return *jax.vmap(one)(KEYS), outcomes(game, Decentralised(policy, game), KEYS).final
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+QUICKEST = ("masac", "masac-lyapunov", "decentralised-sac", "matd3")
+OTHERS = [pytest.param(n, marks=pytest.mark.slow) for n in ALGORITHMS if n not in QUICKEST]
+
+
+@pytest.mark.parametrize("name", [*QUICKEST, *OTHERS])
 def test_every_algorithm_finds_the_answers(name):
     algorithm = ALGORITHMS[name]
     carry = begin(KINDS, algorithm, jax.random.split(jax.random.key(0), 3))
