@@ -195,7 +195,7 @@ GUARDS = [
     Guard(
         "21 one diverged seed of several (processes)",
         "marlyap/workers.py",
-        (("            failed.append(", "            raise UserError("),),
+        (("            failed.append(said", "            raise UserError(said"),),
         "tests/test_resume.py::test_a_process_that_fails_leaves_the_other_seeds_alone",
     ),
     Guard(
