@@ -400,9 +400,9 @@ def test_the_agent_and_the_step_of_a_bad_reward_are_named():
 
 def test_the_first_fault_of_an_episode():
     x = np.zeros((3, 4, 2, 5), np.float32)
-    assert int(first_fault(x)) == -1
+    assert int(first_fault(jnp.asarray(x))) == -1
     x[2, 3, 0, 1], x[0, 3, 1, 4], x[1, 2, 1, 0] = np.nan, np.inf, -np.inf
-    assert divmod(int(first_fault(x)), 2) == (2, 1)
+    assert divmod(int(first_fault(jnp.asarray(x))), 2) == (2, 1)
 
 
 def test_a_process_that_fails_leaves_the_other_seeds_alone(tmp_path, monkeypatch):
