@@ -16,6 +16,7 @@ from marlyap import store
 from marlyap.errors import UserError
 
 
+KNOWN = ("Unicycle", "DoubleIntegrator", "SingleIntegrator")
 CLOSE = 2e-3  # relative to the threshold: a rollout this near to it may fall on either side
 
 
@@ -26,15 +27,21 @@ class Rejected(UserError):
 def recheck(path: Path | str) -> dict[str, Any]:
     """Derive every sampled figure anew. Returns what agreed and what was not looked at.
 
-    Raises Rejected (a UserError) at the first figure that differs, and UserError for a file that
-    is damaged or about a game this checker does not know.
+    Raises Rejected (a UserError) at the first figure that differs and for a file that is no
+    certificate, and UserError for one that is damaged or about a game this checker does not know.
     """
-    arrays, meta = store.read(Path(path), "certificate")
-    parts = [np.ascontiguousarray(arrays[f"starts/{k}"]).tobytes() for k in ("x", "goal")]
-    starts = hashlib.sha256(b"".join(parts)).hexdigest()
-    agree("the hash of the starts", starts, meta["starts_sha256"])
-    own = {k[11:]: v for k, v in arrays.items() if k.startswith("controller/")}
-    agree("the hash of the policy", store.hash_arrays(own), meta["policy"])
+    try:
+        return derive(*store.read(Path(path), "certificate"))
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        what = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".")
+        raise Rejected(f"{path} is no certificate ({what}); use another copy of it.") from error
+
+
+def derive(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> dict[str, Any]:
+    starts = b"".join(arrays[f"starts/{k}"].tobytes() for k in ("x", "goal"))
+    agree("the hash of the starts", hashlib.sha256(starts).hexdigest(), meta["starts_sha256"])
+    own = store.hash_arrays({k[11:]: v for k, v in arrays.items() if k.startswith("controller/")})
+    agree("the hash of the policy", own, meta["policy"])
     verdicts, sim = meta["verdicts"], Simulator(meta, arrays)
     sampled = [n for n, v in verdicts.items() if v["confidence"] is not None]
     tail = (1 - meta["confidence"]) / (max(1, len(sampled)) * meta["checkpoints"])
@@ -45,15 +52,10 @@ def recheck(path: Path | str) -> dict[str, Any]:
         if worst is not None and not worst.get("change", {}).get("spread"):
             start = arrays["starts/x"][worst["episode"]].tolist()
             agree(f"the worst start of {name}", start, worst["state"]["x"])
-        if check is None:
-            left.append(name)
-            continue
-        done[name] = check(sim, verdicts[name], meta["certificates"][name], tail)
-        left += done[name].pop("left", [])
+        if check is not None:
+            done[name] = check(sim, verdicts[name], meta["certificates"][name], tail)
+        left += [name] if check is None else done[name].pop("left", [])
     return {"agrees": True, "rechecked": done, "not_rechecked": left}
-
-
-# --- Statistics ----------------------------------------------------------------------------------
 
 
 def mass(n: int, p: float) -> np.ndarray:
@@ -80,41 +82,34 @@ def order(sample: np.ndarray, q: float, tail: float) -> float:
     return float(np.sort(sample)[j]) if j < n else math.inf
 
 
-# --- The world again -----------------------------------------------------------------------------
-
-
 class Simulator:
     """The closed loop of a rendezvous, with a change to the game where one is asked for."""
 
     def __init__(self, meta: dict[str, Any], arrays: dict[str, np.ndarray]):
         self.game, self.controller, self.V = meta["game"], meta["controller"], meta["V"]
         self.arrays, self.cache = arrays, {}
-        known = ("Unicycle", "DoubleIntegrator", "SingleIntegrator")
         model = self.game.get("dynamics", {})
         self.kind, self.limits = model.get("kind"), np.array(model.get("limits", []))
-        if self.game["kind"] != "Rendezvous" or self.kind not in known:
-            raise UserError(f"recheck: the game {self.game['kind']} with {self.kind} is not known.")
-        if model["integrator"] != "euler" or self.game["graph"].startswith("disk"):
-            raise UserError("recheck: only semi-implicit Euler and fixed graphs are known.")
-        if self.controller["kind"] != "Decentralised":
-            raise UserError("recheck: only trained policies are known, not hand-written ones.")
+        world = self.game["kind"], self.controller["kind"], model.get("integrator")
+        fixed = not self.game["graph"].startswith("disk")
+        if world != ("Rendezvous", "Decentralised", "euler") or not fixed or self.kind not in KNOWN:
+            known = "rendezvous on a fixed graph by Euler steps with a trained policy"
+            raise UserError(f"recheck: only {known} is known, not {world} of {self.kind}.")
         self.slots, self.leads = arrays["graph/slots"], arrays["graph/leads"]
 
     def roll(self, n: int, steps: int, change: dict[str, Any]) -> dict[str, np.ndarray]:
         """States [n, steps + 1, agent, .] and distances, from the first n starts."""
-        name = (n, steps, repr(change))
-        if name in self.cache:
+        if (name := (n, steps, repr(change))) in self.cache:
             return self.cache[name]
-        x = self.arrays["starts/x"][:n].astype(float)
-        goal = self.arrays["starts/goal"][:n].astype(float)
+        x, goal = (self.arrays[f"starts/{k}"][:n].astype(float) for k in ("x", "goal"))
         x[..., :2] *= change.get("spread", 1.0)
         linked, present = self.arrays["graph/linked"].copy(), np.ones(x.shape[1], bool)
         present[list(change.get("gone", []))] = False
         linked &= present[:, None] & present[None, :]
         for a, b in change.get("cut", []):
-            linked[a, b] = linked[b, a] = False
-        queue = [np.zeros((*x.shape[:2], len(self.limits)))] * change.get("delay", 0)
-        seen, limits = [x], change.get("gain", 1.0) * self.limits
+            linked[[a, b], [b, a]] = False
+        queue, seen = [np.zeros((*x.shape[:2], len(self.limits)))] * change.get("delay", 0), [x]
+        limits = change.get("gain", 1.0) * self.limits
         with np.errstate(all="ignore"):
             for _ in range(steps):
                 queue.append(self.act(x, goal, linked))
@@ -122,22 +117,16 @@ class Simulator:
                 seen.append(x)
         states = np.stack(seen, axis=1)
         distance = np.linalg.norm(states[..., :2] - goal[:, None], axis=-1) * present
-        out = {"x": states, "goal": goal, "distance": distance}
-        out["sound"] = np.isfinite(states).all(axis=(1, 2, 3))
-        self.cache = {name: out}
-        return out
+        sound = np.isfinite(states).all(axis=(1, 2, 3))
+        self.cache = {name: {"x": states, "goal": goal, "distance": distance, "sound": sound}}
+        return self.cache[name]
 
     def step(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         dt, x = self.game["dt"], x.copy()
-        if self.kind == "SingleIntegrator":
-            return x + dt * u
-        if self.kind == "DoubleIntegrator":
-            x[..., 2:] += dt * u
-            x[..., :2] += dt * x[..., 2:]
-            return x
-        x[..., 3:] += dt * u
-        x[..., 2] += dt * x[..., 4]
-        x[..., :2] += dt * x[..., 3:4] * self.heading(x)
+        x[..., -2:] += dt * u  # the velocities; of a single integrator, the position itself
+        if self.kind == "Unicycle":
+            x[..., 2] += dt * x[..., 4]
+        x[..., :2] += dt * self.motion(x)[0]
         return x
 
     def heading(self, x: np.ndarray) -> np.ndarray:
@@ -152,39 +141,31 @@ class Simulator:
         return (x[..., 2:], x[..., 2:]) if x.shape[-1] == 4 else (0 * x, x[..., :0])
 
     def observe(self, x: np.ndarray, goal: np.ndarray, linked: np.ndarray) -> np.ndarray:
-        h, (v, rates), p = self.heading(x), self.motion(x), x[..., :2]
-        rows = []
+        h, (v, rates), p, rows = self.heading(x), self.motion(x), x[..., :2], []
         for i, slots in enumerate(self.slots):
-            lead, flag = float(self.leads[i]), np.full((len(x), 1), float(self.leads[i]))
-            to_goal = lead * frame(h[:, i], goal[:, i] - p[:, i])
+            flag = np.full((len(x), 1), float(self.leads[i]))
+            to_goal = flag * frame(h[:, i], goal[:, i] - p[:, i])
             row = [rates[:, i], flag, to_goal, magnified(to_goal, self.game["radius"])]
             for j in slots:
-                width = 9 if self.game["headings"] else 7
-                if j < 0 or not linked[i, j]:
-                    row.append(np.zeros((len(x), width)))
-                    continue
-                gap = frame(h[:, i], p[:, j] - p[:, i])
-                row += [np.ones((len(x), 1)), gap, magnified(gap, self.game["radius"])]
-                row += [frame(h[:, i], v[:, j])]
-                row += [frame(h[:, i], h[:, j])] if self.game["headings"] else []
+                gap, there = frame(h[:, i], p[:, j] - p[:, i]), float(j >= 0 and linked[i, j])
+                sight = [1 + 0 * flag, gap, magnified(gap, self.game["radius"])]
+                sight += [frame(h[:, i], of[:, j]) for of in (v, h)[: 1 + self.game["headings"]]]
+                row += [there * part for part in sight]
             rows.append(np.concatenate(row, axis=1))
         return np.stack(rows, axis=1)
 
     def act(self, x: np.ndarray, goal: np.ndarray, linked: np.ndarray) -> np.ndarray:
-        obs, shared = self.observe(x, goal, linked), self.controller["policy"]["pi"]["shared"]
-        layers = self.layers("controller/policy.pi.net")
+        obs, layers = self.observe(x, goal, linked), self.layers("controller/policy.pi.net")
+        shared = self.controller["policy"]["pi"]["shared"]
         pick = lambda i: [{k: w if shared else w[i] for k, w in l.items()} for l in layers]
         out = np.stack([forward(pick(i), obs[:, i]) for i in range(x.shape[1])], axis=1)
         return np.tanh(out[..., : out.shape[-1] // 2])
 
     def layers(self, prefix: str) -> list[dict[str, np.ndarray]]:
-        out = []
-        while f"{prefix}.layers.{len(out)}.weight" in self.arrays:
-            at = f"{prefix}.layers.{len(out)}"
-            names = {"W": "weight", "b": "bias", "gain": "norm.0", "offset": "norm.1"}
-            held = {k: f"{at}.{v}" for k, v in names.items() if f"{at}.{v}" in self.arrays}
-            out.append({k: self.arrays[v].astype(float) for k, v in held.items()})
-        return out
+        names = {"W": "weight", "b": "bias", "gain": "norm.0", "offset": "norm.1"}
+        held = [{k: f"{prefix}.layers.{i}.{v}" for k, v in names.items()} for i in range(9)]
+        get = lambda l: {k: self.arrays[v].astype(float) for k, v in l.items() if v in self.arrays}
+        return [get(layer) for layer in held if layer["W"] in self.arrays]
 
     def values(self, seen: dict[str, np.ndarray], time: int) -> np.ndarray:
         """V of the first `time` states of every rollout."""
@@ -193,16 +174,14 @@ class Simulator:
             cost = np.maximum(seen["distance"] - rho, 0).mean(axis=2)
             return sum(cost[:, k : k + time] for k in range(self.V["T"]))  # pyright: ignore
         x, h = seen["x"][:, :time], self.heading(seen["x"][:, :time])
-        to_goal = frame(h, seen["goal"][:, None] - x[..., :2])
-        e = np.concatenate([to_goal, self.motion(x)[1]], axis=-1)
+        e = np.concatenate([frame(h, seen["goal"][:, None] - x[..., :2]), self.motion(x)[1]], -1)
         if kind == "Quadratic":
             return np.einsum("...i,ij,...j", e, self.arrays["V/P"].astype(float), e).sum(-1)
         if kind != "Norm":
             raise UserError(f"recheck: V of kind {kind} is not known.")
         e, layers = e.reshape(*e.shape[:2], -1), self.layers("V/net.net")
         change = forward(layers, e) - forward(layers, np.zeros(e.shape[-1]))
-        norm = lambda y: np.sqrt((y * y).sum(-1))
-        return norm(change) + self.V["net"]["slope"] * norm(e)
+        return np.hypot.reduce(change, -1) + self.V["net"]["slope"] * np.hypot.reduce(e, -1)
 
 
 def frame(h: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -224,59 +203,46 @@ def forward(layers: list[dict[str, np.ndarray]], x: np.ndarray) -> np.ndarray:
     return x
 
 
-# --- The claims again ----------------------------------------------------------------------------
-
-
 def agree(what: str, found: Any, said: Any) -> None:
     if found != said:
         raise Rejected(f"certificate: {what} is {found}, not {said} as the file says.")
 
 
-def near(what: str, found: float, said: float | None, room: float) -> None:
-    if said is None and not math.isfinite(found):
-        return
+def near(what: str, found: Any, said: Any, room: Any) -> None:
     if said is None or not abs(found - said) <= room:
-        raise Rejected(f"certificate: {what} is {found:.9g}, not {said} as the file says.")
+        agree(what, found if math.isfinite(found) else None, said)
 
 
 def counted(v: dict, worse: Any, limit: Any, sound: Any, tail: float, scale: float = 0.0) -> dict:
     """Count rollouts with worse <= limit, and compare count and bound with the verdict's."""
-    room = CLOSE * max(abs(limit), scale)
+    n, room = len(worse), CLOSE * max(abs(limit), scale)
     with np.errstate(invalid="ignore"):
         k = int((sound & (worse <= limit)).sum())
         border = int((sound & (np.abs(worse - limit) <= room)).sum())
-    n = len(worse)
-    if v["trials"] != n or abs(k - v["successes"]) > border:
-        raise Rejected(
-            f"certificate: {v['name']} counts {k} of {n} ({border} on the border), not "
-            f"{v['successes']} of {v['trials']} as the file says."
-        )
+    agree(f"the number of rollouts of {v['name']}", n, v["trials"])
+    near(f"the successes of {v['name']}", k, v["successes"], border)
     bound = lower(v["successes"], n, tail) if n else 0.0
     near(f"the bound of {v['name']}", bound, v["bound"], 1e-9)
-    if "share_asked" in v["figures"]:
-        short = v["bound"] < v["figures"]["share_asked"]
-        if v["holds"] and short:
-            raise Rejected(f"certificate: {v['name']} is said to hold, which its bound denies.")
+    if v["holds"] and v["bound"] < v["figures"].get("share_asked", 0.0):
+        raise Rejected(f"certificate: {v['name']} does not hold by its bound, as the file says.")
     return {"trials": n, "successes": k, "bound": bound, "border": border}
 
 
 def reach(sim: Simulator, v: dict, c: dict, tail: float) -> dict[str, Any]:
-    H, radius = sim.game["horizon"], sim.game["radius"]
-    seen = sim.roll(c["rollouts"], H + c.get("stay", 0), {})
-    worse = seen["distance"][:, H:].max(axis=(1, 2))
-    return counted(v, worse, radius, seen["sound"], tail)
+    seen = sim.roll(c["rollouts"], sim.game["horizon"] + c.get("stay", 0), {})
+    worse = seen["distance"][:, sim.game["horizon"] :].max(axis=(1, 2))
+    return counted(v, worse, sim.game["radius"], seen["sound"], tail)
 
 
 def decrease(sim: Simulator, v: dict, c: dict, tail: float) -> dict[str, Any]:
-    H, beta = sim.game["horizon"], c["beta"]
+    H = sim.game["horizon"]
     seen = sim.roll(c["rollouts"], H + (sim.V.get("T") or 0), {})
     inside = (seen["distance"][:, : H + 1] <= sim.game["radius"]).all(axis=2)
     before = np.cumsum(inside[:, :-1], axis=1) == 0
     value = sim.values(seen, H + 1)
     cost = np.maximum(seen["distance"][:, :H] - sim.V["ball"], 0).mean(axis=2)
-    excess = np.where(before, np.diff(value, axis=1) + beta * cost, -np.inf).max(axis=1)
-    excess = np.where(inside.any(axis=1), excess, np.inf)
-    return counted(v, excess, 0.0, seen["sound"], tail, scale=1e-2)
+    excess = np.where(before, np.diff(value, axis=1) + c["beta"] * cost, -np.inf).max(axis=1)
+    return counted(v, excess, 0.0, seen["sound"] & inside.any(axis=1), tail, scale=1e-2)
 
 
 def contraction(sim: Simulator, v: dict, c: dict, tail: float) -> dict[str, Any]:
@@ -284,8 +250,8 @@ def contraction(sim: Simulator, v: dict, c: dict, tail: float) -> dict[str, Any]
     seen = sim.roll(c["rollouts"], H + 1, {})
     cost = seen["distance"].mean(axis=2)
     floor = sim.game["radius"] if c["c_min"] is None else c["c_min"]
-    now, ahead = cost[:, : H - T + 1], cost[:, T : H + 1]
-    ratio = np.where(now >= floor, ahead / np.where(now > 0, now, 1.0), -np.inf).max(axis=1)
+    now, ahead = np.maximum(cost[:, : H - T + 1], 1e-300), cost[:, T : H + 1]
+    ratio = np.where(now >= floor, ahead / now, -np.inf).max(axis=1)
     return counted(v, ratio, 1 - beta, seen["sound"], tail, scale=1.0)
 
 
@@ -293,12 +259,8 @@ def basin(sim: Simulator, v: dict, c: dict, tail: float) -> dict[str, Any]:
     H = sim.game["horizon"]
     seen = sim.roll(c["rollouts"], H + max(c["stay"], sim.V.get("T") or 0), {})
     level, V0 = v["figures"]["level"], sim.values(seen, 1)[:, 0]
-    inside = V0 <= level * (1 + 1e-5)
-    edge = int((np.abs(V0 - level) <= CLOSE * level).sum())
-    if abs(int(inside.sum()) - v["trials"]) > edge:
-        raise Rejected(
-            f"certificate: {int(inside.sum())} starts lie in the level set, not {v['trials']}."
-        )
+    inside, edge = V0 <= level * (1 + 1e-5), np.abs(V0 - level) <= CLOSE * level
+    near("the number of starts in the level set", inside.sum(), v["trials"], edge.sum())
     pick = np.argsort(V0)[: v["trials"]]
     worse = seen["distance"][:, H : H + c["stay"] + 1].max(axis=(1, 2))[pick]
     return counted(v, worse, sim.game["radius"], seen["sound"][pick], tail / 2)
@@ -315,35 +277,23 @@ def quantiles(sim: Simulator, v: dict, c: dict, tail: float) -> dict[str, Any]:
         "settling_time": np.where(stays[:, -1], stays.argmax(axis=1) * sim.game["dt"], np.inf),
         "largest_rise": (value - np.minimum.accumulate(value, axis=1)).max(axis=1),
     }
-    room = {"settling_time": 1.01 * sim.game["dt"]}
     for name, s in sample.items():
         found = order(np.where(seen["sound"], s, np.inf), c["q"], tail / 3)
-        near(name, found, bounds[name], room.get(name, CLOSE * abs(bounds[name] or 0.0) + 1e-4))
+        room = CLOSE * abs(bounds[name] or 0.0) + (name == "settling_time") * sim.game["dt"]
+        near(name, found, bounds[name], room + 1e-4)
     return {"bounds": bounds}
 
 
 def robustness(sim: Simulator, v: dict, c: dict, tail: float) -> dict[str, Any]:
-    curve, out, left = v["figures"]["curve"], {}, []
-    for point in curve:
-        if {"noise", "drop"} & {*point["change"]}:
-            left.append(f"robustness: {point['perturbation']}")
-            continue
+    curve, out = v["figures"]["curve"], {}
+    chance = [p for p in curve if {"noise", "drop"} & {*p["change"]}]
+    for point in (p for p in curve if p not in chance):
         seen = sim.roll(c["rollouts"], sim.game["horizon"], point["change"])
-        as_verdict = point | {"name": point["perturbation"], "figures": {"share_asked": c["share"]}}
-        worse = seen["distance"][:, -1].max(axis=1)
-        part = tail / len(curve)
-        out[point["perturbation"]] = counted(
-            as_verdict, worse, sim.game["radius"], seen["sound"], part
-        )
-    return {"curve": out, "left": left}
+        said = point | {"name": point["perturbation"], "figures": {"share_asked": c["share"]}}
+        worse, part = seen["distance"][:, -1].max(axis=1), tail / len(curve)
+        out[said["name"]] = counted(said, worse, sim.game["radius"], seen["sound"], part)
+    return {"curve": out, "left": [f"robustness: {p['perturbation']}" for p in chance]}
 
 
-CHECKS = {
-    "reach": reach,
-    "reach-and-stay": reach,
-    "decrease": decrease,
-    "contraction": contraction,
-    "basin": basin,
-    "quantiles": quantiles,
-    "robustness": robustness,
-}
+CHECKS = {f.__name__: f for f in (reach, decrease, contraction, basin, quantiles, robustness)}
+CHECKS["reach-and-stay"] = reach

@@ -151,6 +151,51 @@ def test_a_truncated_file_is_one_sentence(bundle, tmp_path):
         recheck(target)
 
 
+def spots(value, path=()):
+    """Every place in nested JSON."""
+    yield path
+    items = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
+    for key, inner in items:
+        yield from spots(inner, (*path, key))
+
+
+ODD = [None, True, -1, 0, 1e308, "", "x", [], {}, [[]], {"kind": "Unicycle"}]
+
+
+@pytest.mark.parametrize("start", range(1, 4))
+def test_any_odd_value_anywhere_is_rejected_or_harmless(bundle, tmp_path, start):
+    """Eight places spread over the file, an odd value at each; nothing else may come of it."""
+    count = len([*spots(store.read(bundle[0], "certificate")[1])])
+    for place in range(start, count, count // 8):
+
+        def change(meta, arrays, place=place):
+            *path, last = [*spots(meta)][place]
+            for key in path:
+                meta = meta[key]
+            meta[last] = ODD[place % len(ODD)]
+
+        target = altered(bundle[0], tmp_path / str(place), change)
+        try:
+            recheck(target)
+        except UserError as error:
+            assert "\n" not in str(error)
+
+
+def test_a_certificate_without_one_of_its_arrays_is_rejected(bundle, tmp_path):
+    arrays, _ = store.read(bundle[0], "certificate")
+    for number, name in enumerate(arrays):
+        target = altered(bundle[0], tmp_path / str(number), lambda _, a, name=name: a.pop(name))
+        if name.startswith(("starts/", "controller/", "graph/")):
+            with pytest.raises(UserError):
+                recheck(target)
+
+
 @pytest.mark.parametrize(
     "dynamics, kind",
     [(Unicycle(), "norm"), (DoubleIntegrator(), "quadratic"), (SingleIntegrator(), "norm")],
