@@ -112,36 +112,31 @@ class Updates:
 def updates(
     game: AbstractGame, algorithm: AbstractAlgorithm, count: int, episodes: int = 64
 ) -> Updates:
-    """`count` updates of `algorithm` from `episodes` random episodes, compiled."""
+    """About `count` updates of `algorithm` from `episodes` random episodes, compiled."""
     trainer = Trainer(
         game,
         algorithm,
         Schedule(
             steps=episodes * game.horizon,
             environments=1,
+            steps_per_update=1,
             warmup=episodes * game.horizon,
             capacity=1,
         ),
     )
     carry = eqx.filter_jit(trainer.begin)(jax.random.key(0))
     dynamic, static = eqx.partition(carry.learner, eqx.is_array)
-    a = algorithm
-
-    def learn(dynamic, key, memory):
-        k_sample, k_update = jax.random.split(key)
-        batch = memory.sample(k_sample, a.batch, a.gamma, a.n_step)
-        learner, _ = a.update(eqx.combine(dynamic, static), batch, k_update, jnp.ones(()))
-        return eqx.filter(learner, eqx.is_array)
 
     def several(dynamic, memory, key):
-        one = lambda d, k: (learn(d, k, memory), None)
-        return jax.lax.scan(one, dynamic, jax.random.split(key, count))[0]
+        learner = eqx.combine(dynamic, static)
+        learner, _, _ = trainer.learn(learner, memory, key, jnp.ones(()), lambda learner: None)
+        return eqx.filter(learner, eqx.is_array)
 
     key = jax.random.key(1)
     compiled = jax.jit(several).lower(dynamic, carry.memory, key).compile()
     return Updates(
         run=lambda: jax.block_until_ready(compiled(dynamic, carry.memory, key)),
-        count=count,
+        count=trainer.updates_per_iteration,
         xla=(compiled.cost_analysis() or {}).get("flops", math.nan),
         products=products(compiled.as_text()),
         memory=compiled.memory_analysis().temp_size_in_bytes,

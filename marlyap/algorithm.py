@@ -45,9 +45,12 @@ class AbstractOffPolicy(AbstractAlgorithm):
 
     @abc.abstractmethod
     def update(
-        self, learner: PyTree, b: Transition, key: Key, decay: Scalar
+        self, learner: PyTree, b: Transition, decay: Scalar
     ) -> tuple[PyTree, dict[str, Scalar]]:
-        """One gradient step on a batch, rates multiplied by `decay`; the dict is for the log."""
+        """One gradient step on a batch, rates multiplied by `decay`; the dict is for the log.
+
+        What is random in it comes with the batch, as `b.noise`.
+        """
 
     @abc.abstractmethod
     def explore(self, learner: PyTree) -> AbstractExplorer:

@@ -7,6 +7,7 @@ one for the gradient of its input and one for the gradient of its weights.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -78,3 +79,22 @@ def _backward(residual: tuple[Array, Array], g: Array) -> tuple[Array, Array]:
 
 
 matmul.defvjp(lambda W, x: (matmul(W, x), (W, x)), _backward)
+
+
+def total(x: Float[Array, "*stack in batch"]) -> Float[Array, "*stack 1 batch"]:
+    """The sum over the features, as a product with ones.
+
+    XLA takes whatever leads to a plain sum, exp and log too, into the loop of the sum, and where
+    that is not over the last axis it computes one number at a time.
+    """
+    ones = jnp.ones((*x.shape[:-2], 1, x.shape[-2]))
+    return jnp.matmul(ones, x, precision="highest")
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(1,))
+def spread(x: Float[Array, "*stack 1 batch"], size: int) -> Float[Array, "*stack in batch"]:
+    """`x` for each of `size` features; its gradient is a `total`."""
+    return jnp.broadcast_to(x, (*x.shape[:-2], size, x.shape[-1]))
+
+
+spread.defvjp(lambda x, size: (spread(x, size), None), lambda size, _, g: (total(g),))

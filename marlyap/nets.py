@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from marlyap.layout import batch_last, matmul, rows_as_columns
+from marlyap.layout import batch_last, matmul, rows_as_columns, spread, total
 from marlyap.rollout import AbstractExplorer
 from marlyap.types import Action, Features, Key, Obs, Scalar
 
@@ -45,9 +45,9 @@ class Layer(eqx.Module):
         # The mean over outputs that LayerNorm subtracts is linear in W and b: take it there.
         centred = lambda a, axis: a - jnp.mean(a, axis=axis, keepdims=True)
         y = matmul(centred(self.weight, -2), x) + centred(self.bias, -1)[..., None]
-        scale = jax.lax.rsqrt(jnp.mean(y * y, axis=-2, keepdims=True) + EPS)
+        scale = jax.lax.rsqrt(total(y * y) / y.shape[-2] + EPS)
         gain, offset = self.norm
-        return y * scale * gain[..., None] + offset[..., None]
+        return y * spread(scale, y.shape[-2]) * gain[..., None] + offset[..., None]
 
     def lipschitz(self) -> Scalar:
         """An upper bound: the spectral norm of W, and what LayerNorm may stretch next to 0."""
@@ -129,7 +129,7 @@ def _squash(net: MLP, x: tuple[Array, Array, Array]) -> tuple[Array, Array, Arra
     def log_prob(u, z):
         log_normal = -0.5 * z**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
         log_squash = 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))  # log(1 - tanh(u)^2)
-        return jnp.sum(log_normal - log_squash, axis=-2, keepdims=True)
+        return total(log_normal - log_squash)
 
     u = mean + jnp.exp(log_std) * noise
     past = jnp.arctanh(jnp.clip(memory, -1 + 1e-6, 1 - 1e-6))

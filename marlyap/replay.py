@@ -57,13 +57,21 @@ class Replay(eqx.Module):
 
     def sample(self, key: Key, batch: int, gamma: float, n: int = 1) -> Transition:
         """B ~ D: `batch` transitions with n-step rewards, each step equally likely."""
-        k_row, k_time = jax.random.split(key)
-        row = jax.random.randint(k_row, (batch,), 0, self.size)
-        t = jax.random.randint(k_time, (batch,), 0, self.time)
-        return jax.vmap(lambda row, t: self.transition(row, t, gamma, n))(row, t)
+        k_where, k_noise = jax.random.split(key)
+        most = jnp.stack([self.size, jnp.asarray(self.time)]).astype(jnp.uint32)[:, None]
+        row, t = (jax.random.bits(k_where, (2, batch)) % most).astype(int)  # uneven by size / 2^32
+        # Drawn with the batch last: with one as short as `du`, XLA would use 2 of 16 lanes.
+        agents, du = self.episodes.action.shape[2:]
+        noise = jnp.moveaxis(jax.random.normal(k_noise, (agents, 2, du, batch)), -1, 0)
+        return jax.vmap(lambda *one: self.transition(*one, gamma, n))(row, t, noise)
 
     def transition(
-        self, row: Int[Array, ""], t: Int[Array, ""], gamma: float, n: int = 1
+        self,
+        row: Int[Array, ""],
+        t: Int[Array, ""],
+        noise: Float[Array, "agent 2 du"],
+        gamma: float,
+        n: int = 1,
     ) -> Transition:
         """The step t of one episode; fewer than n steps are summed where the episode is cut.
 
@@ -88,4 +96,5 @@ class Replay(eqx.Module):
             discount=gamma**steps * alive[-1],
             cost_to_go=e.cost_to_go[row, t],
             cost_ahead=e.cost_ahead[row, t],
+            noise=noise,
         )

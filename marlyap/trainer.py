@@ -1,5 +1,6 @@
 """The outer loop of Algorithms 1 and 2: play, remember, learn; compiled an iteration at a time."""
 
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -24,6 +25,9 @@ from marlyap.rollout import (
 )
 from marlyap.seeds import stream
 from marlyap.types import Key, Scalar
+
+
+AHEAD = 8  # batches that are drawn together, at most
 
 
 class Schedule(eqx.Module):
@@ -151,14 +155,20 @@ class Trainer(eqx.Module):
         assert isinstance(a, AbstractOffPolicy)
         dynamic, static = eqx.partition(learner, eqx.is_array)
 
-        def one(dynamic, key):
-            k_sample, k_update = jax.random.split(key)
-            batch = memory.sample(k_sample, a.batch, a.gamma, a.n_step)
-            learner, info = a.update(eqx.combine(dynamic, static), batch, k_update, decay)
+        def one(dynamic, batch):
+            learner, info = a.update(eqx.combine(dynamic, static), batch, decay)
             return eqx.filter(learner, eqx.is_array), (info, watch(learner))
 
-        keys = jax.random.split(key, self.updates_per_iteration)
-        dynamic, (info, seen) = jax.lax.scan(one, dynamic, keys)
+        def several(dynamic, keys):
+            # Batches are drawn ahead of the loop that uses them. In the same loop XLA would draw
+            # each number again wherever it is used, and not by vectors.
+            draw = lambda key: memory.sample(key, a.batch, a.gamma, a.n_step)
+            return jax.lax.scan(one, dynamic, jax.vmap(draw)(keys))
+
+        ahead = math.gcd(self.updates_per_iteration, AHEAD)
+        keys = jax.random.split(key, (self.updates_per_iteration // ahead, ahead))
+        dynamic, (info, seen) = jax.lax.scan(several, dynamic, keys)
+        seen = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), seen)
         return eqx.combine(dynamic, static), jax.tree.map(jnp.mean, info), seen
 
     def judge(self, carry: Carry) -> tuple[Carry, dict[str, Scalar]]:

@@ -45,6 +45,7 @@ class Transition(eqx.Module):
     discount: Scalar
     cost_to_go: Float[Array, "agent"]  # L_target, the sum of the next T costs
     cost_ahead: Float[Array, "agent"]  # c_{t+T}
+    noise: Float[Array, "agent 2 du"]  # standard normal, for the actions drawn at s and at s'
 
 
 class Trajectory(eqx.Module):

@@ -117,6 +117,7 @@ def batch(shape):
         discount=jnp.where(jnp.arange(16) % 4 == 3, 0.0, 0.95**2).astype(jnp.float32),
         cost_to_go=3 * jnp.abs(draw(n)),
         cost_ahead=jnp.abs(draw(n)),
+        noise=draw(n, 2, shape.du),
     )
 
 

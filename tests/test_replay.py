@@ -38,7 +38,8 @@ def episode(number, end=None):
 stack = lambda *episodes: jax.tree.map(lambda *x: jnp.stack(x), *episodes)
 add = eqx.filter_jit(Replay.add)
 sample = eqx.filter_jit(Replay.sample)
-transition = eqx.filter_jit(Replay.transition)
+QUIET = jnp.zeros((1, 2, 2))
+transition = eqx.filter_jit(lambda memory, row, t, *rest: memory.transition(row, t, QUIET, *rest))
 
 
 def numbers(memory):

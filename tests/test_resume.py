@@ -353,8 +353,8 @@ def test_what_fails_every_time_is_given_up(tmp_path, monkeypatch):
 class Faulty(MASAC):
     """In the third update the bias of agent 1 becomes infinite: as an overflow would have it."""
 
-    def update(self, learner, b, key, decay):
-        learner, info = super().update(learner, b, key, decay)
+    def update(self, learner, b, decay):
+        learner, info = super().update(learner, b, decay)
         bias = lambda l: l.pi.value.net.layers[1].bias
         third = learner.pi.memory.count == 3
         value = bias(learner).at[1, 2].add(jnp.where(third, jnp.inf, 0.0))

@@ -94,12 +94,12 @@ class MADDPG(AbstractOffPolicy):
         """Minus the team's value of the current policies' actions, by the first critic."""
         return -jnp.mean(Q(b.features, pi.mode(b.obs))[0])
 
-    def update(self, learner, b, key, decay):
+    def update(self, learner, b, decay):
         """Algorithm 1 of Lowe et al., with the three changes of Fujimoto et al. in it."""
         l = learner
 
         # a' = mu'(o') + clip(eps, -c, c)
-        eps = self.smoothing * jax.random.normal(key, b.action.shape)
+        eps = self.smoothing * b.noise[:, :, 0]
         eps = jnp.clip(eps, -self.smoothing_clip, self.smoothing_clip)
         next_action = jnp.clip(jax.vmap(l.pi_bar.mode)(b.next_obs) + eps, -1.0, 1.0)
 

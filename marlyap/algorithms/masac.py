@@ -120,17 +120,16 @@ class MASAC(AbstractOffPolicy):
         surplus = jnp.sum(now.log_prob + self.entropy)
         return -jnp.exp(log_alpha) * surplus
 
-    def update(self, learner, b, key, decay):
+    def update(self, learner, b, decay):
         """The assignments of Algorithm 2 in its order; without a constraint, of Algorithm 1."""
         l = learner
-        noise = jax.random.normal(key, (2, *b.action.shape))
 
         # a ~ pi_phi(. | s_t) and a_{t+1} ~ pi_phi(. | s_{t+1}): the same for every objective
-        draw = lambda pi, b, noise_now, noise_next: (
-            pi.sample(b.obs, noise_now, b.action),
-            pi.sample(b.next_obs, noise_next, b.action),
+        draw = lambda pi, b: (
+            pi.sample(b.obs, b.noise[:, 0], b.action),
+            pi.sample(b.next_obs, b.noise[:, 1], b.action),
         )
-        now, nxt = jax.vmap(lambda *one: draw(l.pi.value, *one))(b, *noise)
+        now, nxt = jax.vmap(lambda b: draw(l.pi.value, b))(b)
 
         # theta <- theta - iota_Q grad J_Q
         J_Q = lambda Q, b, nxt: self.J_Q(Q, l, b, nxt)
@@ -138,8 +137,8 @@ class MASAC(AbstractOffPolicy):
         l = eqx.tree_at(lambda l: l.Q, l, Q)
 
         # phi <- phi - iota_pi grad J_pi, eq. (11); XLA merges this drawing with the one above
-        J_pi = lambda pi, b, *noise: self.J_pi(*draw(pi, b, *noise), l, b)
-        pi, loss_pi = l.pi.descend(J_pi, b, *noise, rate=decay * self.rate_pi)
+        J_pi = lambda pi, b: self.J_pi(*draw(pi, b), l, b)
+        pi, loss_pi = l.pi.descend(J_pi, b, rate=decay * self.rate_pi)
 
         # alpha <- alpha - iota_alpha grad J_alpha
         log_alpha, _ = l.log_alpha.descend(self.J_alpha, now, rate=decay * self.rate_alpha)

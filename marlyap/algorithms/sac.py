@@ -37,15 +37,14 @@ class DecentralisedSAC(MASAC):
             jax.random.split(key, shape.agents)
         )
 
-    def update(self, learner, b, key, decay):
+    def update(self, learner, b, decay):
         """A step of every agent's own learning; the log has the mean over agents."""
         agents = jnp.arange(b.action.shape[1])
 
-        def step(l, i, key):
-            return MASAC.update(self, l, jax.vmap(lambda b: alone(b, i))(b), key, decay)
+        def step(l, i):
+            return MASAC.update(self, l, jax.vmap(lambda b: alone(b, i))(b), decay)
 
-        keys = jax.random.split(key, len(agents))
-        learner, info = eqx.filter_vmap(step)(learner, agents, keys)
+        learner, info = eqx.filter_vmap(step)(learner, agents)
         return learner, jax.tree.map(jnp.mean, info)
 
     def explore(self, learner):
@@ -83,13 +82,13 @@ class CentralisedSAC(MASAC):
     def init(self, shape, key):
         return MASAC.init(self, shape._replace(obs=shape.agents * shape.obs), key)
 
-    def update(self, learner, b, key, decay):
+    def update(self, learner, b, decay):
         """The step of MASAC, where everyone observes everything."""
 
         def widened(b: Transition) -> Transition:
             return dataclasses.replace(b, obs=joint(b.obs), next_obs=joint(b.next_obs))
 
-        return MASAC.update(self, learner, jax.vmap(widened)(b), key, decay)
+        return MASAC.update(self, learner, jax.vmap(widened)(b), decay)
 
     def explore(self, learner) -> AbstractExplorer:
         return JointExplorer(Sampled(learner.pi.value))
