@@ -138,7 +138,7 @@ def updates(
         run=lambda: jax.block_until_ready(compiled(dynamic, carry.memory, key)),
         count=trainer.updates_per_iteration,
         xla=(compiled.cost_analysis() or {}).get("flops", math.nan),
-        products=products(compiled.as_text()),
+        products=Counter({p: k for p, k in products(compiled.as_text()).items() if p.proper}),
         memory=compiled.memory_analysis().temp_size_in_bytes,
     )
 
@@ -158,6 +158,13 @@ class Product:
         inner = math.prod(self.left[i] for i in contract)
         stack = math.prod(self.left[i] for i in batch)
         return 2 * math.prod(self.left) * math.prod(self.right) // (inner * stack)
+
+    @property
+    def proper(self) -> bool:
+        """Not with a single row or column, as where a sum is written as a product with ones."""
+        (contract, other), (batch, beside) = self.axes
+        free = lambda shape, gone: math.prod(n for i, n in enumerate(shape) if i not in gone)
+        return min(free(self.left, contract + batch), free(self.right, other + beside)) > 1
 
     def job(self, repeats: int) -> Callable[[], Any]:
         """`repeats` such products one after the other, compiled."""

@@ -38,7 +38,7 @@ def episode(number, end=None):
 stack = lambda *episodes: jax.tree.map(lambda *x: jnp.stack(x), *episodes)
 add = eqx.filter_jit(Replay.add)
 sample = eqx.filter_jit(Replay.sample)
-QUIET = jnp.zeros((1, 2, 2))
+QUIET = jnp.zeros((AGENTS, 2, 2))
 transition = eqx.filter_jit(lambda memory, row, t, *rest: memory.transition(row, t, QUIET, *rest))
 
 
