@@ -2,7 +2,7 @@
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from marlyap import store
-from marlyap.certificate import AbstractCertificate
+from marlyap.certificate import AbstractCertificate, Verdict
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.identity import named_arrays, plain, policy_hash, without_arrays, words
@@ -34,13 +34,14 @@ def certify(
     V: AbstractLyapunov | None = None,
     checkpoints: int = 1,
     policy: str | None = None,
+    tell: Callable[[Verdict], None] = lambda verdict: None,
 ) -> dict[str, Any]:
     """The verdicts of all `certificates`, true together with `confidence`; `holds` if all hold.
 
     Each sampled one is asked at 1 - (1 - confidence) / (claims * checkpoints) (Bonferroni), with
     `checkpoints` the number of controllers among which this one was or will be chosen by
     certificates. V is by default the T-step cost sum outside a ball of half the radius. `policy`
-    is the hash that the controller was declared with.
+    is the hash that the controller was declared with, and `tell` hears of each verdict at once.
 
     Raises UserError if V is not 0 on the target set, if there are too few rollouts for the
     confidence asked for, or if the controller is not the one declared.
@@ -58,7 +59,10 @@ def certify(
     sampled = sum(c.evidence == "statistical" for c in certificates.values())
     each = bonferroni(confidence, max(1, sampled) * checkpoints)
     asked = {name: dataclasses.replace(c, confidence=each) for name, c in certificates.items()}
-    verdicts = {name: c.check(game, controller, V, seed) for name, c in asked.items()}
+    verdicts = {}
+    for name, certificate in asked.items():
+        verdicts[name] = certificate.check(game, controller, V, seed)
+        tell(verdicts[name])
     return {
         "schema": 1,
         "holds": all(v.holds for v in verdicts.values()),

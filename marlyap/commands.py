@@ -18,6 +18,7 @@ from rich.table import Table
 from marlyap import config, film, store
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.algorithms import ALGORITHMS, PRESETS
+from marlyap.certificate import Verdict
 from marlyap.certificates import CERTIFICATES
 from marlyap.certify import certify, save
 from marlyap.conformance import conformance
@@ -264,12 +265,13 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
         chosen[name] = dataclasses.replace(c, rollouts=args.rollouts) if several else c  # pyright: ignore
     # Learnt policies keep moving a little on the target: what counts is leaving the ball.
     V = CostSum(controller=controller, ball=game.radius)
-    result = certify(game, controller, chosen, args.seed, args.confidence, V=V)
+
+    def tell(verdict: Verdict) -> None:
+        mark = "holds" if verdict.holds else "does not hold"
+        (say if args.json else print)(f"[{verdict.evidence}] {verdict.claim}: {mark}.")
+
+    result = certify(game, controller, chosen, args.seed, args.confidence, V=V, tell=tell)
     save(out, result, game, controller, V, replace=args.force)
-    if not args.json:
-        for verdict in result["verdicts"].values():
-            mark = "holds" if verdict["holds"] else "does not hold"
-            print(f"[{verdict['evidence']}] {verdict['claim']}: {mark}.")
     say(f"Certificate: {out}")
     return result | {"certificate": str(out)}, 0
 
@@ -278,7 +280,9 @@ def recheck_certificate(args: Namespace, overrides: Overrides) -> Result:
     """`recheck`: reject the certificate or confirm its figures."""
     result = recheck(args.certificate)
     if not args.json:
-        print(f"{args.certificate}: every sampled figure was derived again and agrees.")
+        print(f"{args.certificate}: derived again, and agree: {', '.join(result['rechecked'])}.")
+        if result["not_rechecked"]:
+            print(f"Not looked at: {', '.join(result['not_rechecked'])}.")
     return result, 0
 
 

@@ -258,7 +258,7 @@ def contraction(sim: Simulator, v: dict, c: dict, tail: float) -> dict[str, Any]
 def basin(sim: Simulator, v: dict, c: dict, tail: float) -> dict[str, Any]:
     H = sim.game["horizon"]
     seen = sim.roll(c["rollouts"], H + max(c["stay"], sim.V.get("T") or 0), {})
-    level, V0 = v["figures"]["level"], sim.values(seen, 1)[:, 0]
+    level, V0 = v["figures"]["level"] or 0.0, sim.values(seen, 1)[:, 0]
     inside, edge = V0 <= level * (1 + 1e-5), np.abs(V0 - level) <= CLOSE * level
     near("the number of starts in the level set", inside.sum(), v["trials"], edge.sum())
     pick = np.argsort(V0)[: v["trials"]]

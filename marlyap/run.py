@@ -133,7 +133,8 @@ class Run:
 
     @property
     def title(self) -> str:
-        return f"{self.names['task']} {self.names['algorithm']} seed {self.seed}"
+        named = [self.names[k] for k in ("task", "algorithm") if k in self.names]
+        return " ".join([*named, f"seed {self.seed}"])
 
     @property
     def checkpoints(self) -> store.Checkpoints:

@@ -69,7 +69,10 @@ class Linearisation(AbstractCertificate):
             state = eqx.tree_at(lambda s: s.x, rest, flat.reshape(rest.x.shape))
             return game.step(state, controller(state, jax.random.key(0))).x.ravel()
 
-        J = np.asarray(jax.jacfwd(step)(rest.x.ravel()), float)
+        # One copy of the state for each row: networks are differentiated backwards, in batches.
+        copies = jnp.tile(rest.x.ravel(), (rest.x.size, 1))
+        _, pull = jax.vjp(jax.vmap(step), copies)
+        J = np.asarray(pull(jnp.eye(rest.x.size))[0], float)
         return float(np.max(np.abs(np.linalg.eigvals(J))))
 
 
