@@ -63,7 +63,8 @@ class Replay(eqx.Module):
         # Drawn with the batch last: with one as short as `du`, XLA would use 2 of 16 lanes.
         agents, du = self.episodes.action.shape[2:]
         noise = jnp.moveaxis(jax.random.normal(k_noise, (agents, 2, du, batch)), -1, 0)
-        return jax.vmap(lambda *one: self.transition(*one, gamma, n))(row, t, noise)
+        take = lambda row, t, noise: self.transition(row, t, noise, gamma, n)
+        return jax.vmap(take)(row, t, noise)
 
     def transition(
         self,
