@@ -1,7 +1,7 @@
 """Analytic policy gradients with and without the decrease condition, and tree pursuit beside them.
 
     ./run python experiments/model_based.py --task rendezvous-path5
-    ./run python experiments/model_based.py --task rendezvous-hard --steps 7680000
+    ./run python experiments/model_based.py --task rendezvous-hard
     ./run python experiments/model_based.py --quick    seconds, to see that it works
     ./run python experiments/model_based.py --draw     the figure again, from the tables alone
 
@@ -32,7 +32,7 @@ def cases(args):
 
 
 if __name__ == "__main__":
-    args = options(__doc__, task="rendezvous-path5", steps=2_560_000, episodes=STARTS)
+    args = options(__doc__, task="rendezvous-path5", steps=7_680_000, episodes=STARTS)
     experiment("model-based", list(cases(args)), args)
     if not (args.quick or args.draw or args.list):
         game = TASKS[args.task]
