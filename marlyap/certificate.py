@@ -197,6 +197,25 @@ def at_least(successes: int, trials: int, share: float, confidence: float) -> tu
     return bound, bound >= share
 
 
+def share_of(
+    certificate: Any, game: AbstractGame, seed: int, found: Found, steps: int
+) -> tuple[float, bool, dict[str, Any]]:
+    """The bound on the share of rollouts that hold, whether it is as large as `certificate` asks,
+    and what every verdict on such a share says of it."""
+    n, k = len(found.holds), int(found.holds.sum())
+    bound, shown = at_least(k, n, certificate.share, certificate.confidence)
+    fields = {
+        "evidence": certificate.evidence,
+        "bound": bound,
+        "confidence": certificate.confidence,
+        "scope": scope(game, steps),
+        "trials": n,
+        "successes": k,
+        "worst": worst_of(game, seed, "certify", found),
+    }
+    return bound, shown, fields
+
+
 def scope(game: AbstractGame, steps: int, disturbance: str = "none") -> dict[str, Any]:
     """What a sampled claim is limited to."""
     return {

@@ -14,11 +14,9 @@ from marlyap.certificate import (
     Evidence,
     Judgement,
     Verdict,
-    at_least,
     enough,
     judged,
-    scope,
-    worst_of,
+    share_of,
 )
 from marlyap.game import AbstractGame
 
@@ -61,8 +59,7 @@ class Composition(AbstractCertificate):
         found = draw("certify", self.rollouts)
         excess = worst_excess(found.figures["V"], M, delta, self.T)
         found = type(found)(found.holds & (excess <= 0), excess, {"excess": excess})
-        n, k = self.rollouts, int(found.holds.sum())
-        bound, shown = at_least(k, n, self.share, self.confidence)
+        bound, shown, fields = share_of(self, game, seed, found, steps)
         farthest = float(np.max(ultimate))
         within = game.radius if self.within is None else self.within
         return Verdict(
@@ -70,14 +67,8 @@ class Composition(AbstractCertificate):
             claim=f"along at least a share {bound:.4f} of the rollouts the agents' functions obey "
             f"inequalities with spectral radius {rho:.3f}, by which all distances would end "
             f"below {farthest:.3g} m",
-            evidence=self.evidence,
+            **fields,
             holds=bool(shown and rho < 1 and farthest <= within),
-            bound=bound,
-            confidence=self.confidence,
-            scope=scope(game, steps),
-            trials=n,
-            successes=k,
-            worst=worst_of(game, seed, "certify", found),
             figures={
                 "rho": rho,
                 "M": M.tolist(),

@@ -12,11 +12,9 @@ from marlyap.certificate import (
     Found,
     Judgement,
     Verdict,
-    at_least,
     enough,
     judged,
-    scope,
-    worst_of,
+    share_of,
 )
 from marlyap.statistics import lower_bound
 
@@ -51,22 +49,15 @@ class Contraction(AbstractCertificate):
         found = judged(self.judge, game, controller, V, seed, "certify", n, H + 1)
         passed = rates(found) >= beta
         found = Found(passed, -rates(found), found.figures)
-        k = int(passed.sum())
-        bound, shown = at_least(k, n, self.share, self.confidence)
+        bound, shown, fields = share_of(self, game, seed, found, H)
         asked = int(np.sum(found.figures["windows"] > 0))
         return Verdict(
             name="contraction",
             claim=f"from at least a share {bound:.4f} of the starts the cost contracts by "
             f"{max(beta, 0.0):.4f} over every {self.T} steps that begin above "
             f"{self.floor(game):g} m",
-            evidence=self.evidence,
+            **fields,
             holds=shown and beta >= self.least and asked > 0,
-            bound=bound,
-            confidence=self.confidence,
-            scope=scope(game, H),
-            trials=n,
-            successes=k,
-            worst=worst_of(game, seed, "certify", found),
             figures={
                 "beta": beta,
                 "T": self.T,

@@ -11,11 +11,9 @@ from marlyap.certificate import (
     Evidence,
     Judgement,
     Verdict,
-    at_least,
     enough,
     judged,
-    scope,
-    worst_of,
+    share_of,
 )
 
 
@@ -39,22 +37,15 @@ class Decrease(AbstractCertificate):
         enough(self.rollouts, self.share, self.confidence)
         H, n = game.horizon, self.rollouts
         found = judged(self.judge, game, controller, V, seed, "certify", n, H + V.beyond)
-        k = int(found.holds.sum())
-        bound, holds = at_least(k, n, self.share, self.confidence)
+        bound, holds, fields = share_of(self, game, seed, found, H)
         steps, bad = (float(np.nansum(found.figures[name])) for name in ("steps", "violations"))
         return Verdict(
             name="decrease",
             claim=f"from at least a share {bound:.4f} of the starts V falls by {self.beta:g} of "
             f"the cost in every step until the ball of {game.radius:g} m is entered, which "
             f"happens within {H * game.dt:g} s",
-            evidence=self.evidence,
+            **fields,
             holds=holds,
-            bound=bound,
-            confidence=self.confidence,
-            scope=scope(game, H),
-            trials=n,
-            successes=k,
-            worst=worst_of(game, seed, "certify", found),
             figures={
                 "share_asked": self.share,
                 "beta": self.beta,

@@ -10,11 +10,9 @@ from marlyap.certificate import (
     Evidence,
     Judgement,
     Verdict,
-    at_least,
     enough,
     judged,
-    scope,
-    worst_of,
+    share_of,
 )
 
 
@@ -33,22 +31,15 @@ class Reach(AbstractCertificate):
 
     def check(self, game, controller, V, seed):
         enough(self.rollouts, self.share, self.confidence)
-        H, n = game.horizon, self.rollouts
-        found = judged(self.judge, game, controller, V, seed, "certify", n, H)
-        k = int(found.holds.sum())
-        bound, holds = at_least(k, n, self.share, self.confidence)
+        H = game.horizon
+        found = judged(self.judge, game, controller, V, seed, "certify", self.rollouts, H)
+        bound, holds, fields = share_of(self, game, seed, found, H)
         return Verdict(
             name="reach",
             claim=f"from at least a share {bound:.4f} of the starts every agent is within "
             f"{game.radius:g} m of its goal at {H * game.dt:g} s",
-            evidence=self.evidence,
+            **fields,
             holds=holds,
-            bound=bound,
-            confidence=self.confidence,
-            scope=scope(game, H),
-            trials=n,
-            successes=k,
-            worst=worst_of(game, seed, "certify", found),
             figures={"share_asked": self.share},
         )
 
@@ -74,23 +65,16 @@ class ReachAndStay(AbstractCertificate):
 
     def check(self, game, controller, V, seed):
         enough(self.rollouts, self.share, self.confidence)
-        steps, n = game.horizon + self.stay, self.rollouts
-        found = judged(self.judge, game, controller, V, seed, "certify", n, steps)
-        k = int(found.holds.sum())
-        bound, holds = at_least(k, n, self.share, self.confidence)
+        steps = game.horizon + self.stay
+        found = judged(self.judge, game, controller, V, seed, "certify", self.rollouts, steps)
+        bound, holds, fields = share_of(self, game, seed, found, steps)
         return Verdict(
             name="reach-and-stay",
             claim=f"from at least a share {bound:.4f} of the starts every agent is within "
             f"{game.radius:g} m of its goal from {game.horizon * game.dt:g} s at the latest "
             f"until {steps * game.dt:g} s",
-            evidence=self.evidence,
+            **fields,
             holds=holds,
-            bound=bound,
-            confidence=self.confidence,
-            scope=scope(game, steps),
-            trials=n,
-            successes=k,
-            worst=worst_of(game, seed, "certify", found),
             figures={"share_asked": self.share, "stay_steps": self.stay},
         )
 
