@@ -95,7 +95,7 @@ def options(doc: str, **defaults: Any) -> argparse.Namespace:
     p.add_argument("--steps", type=int, default=o["steps"], help="environment steps of each run")
     p.add_argument("--seeds", type=int, nargs="+", default=list(o["seeds"]), help="of training")
     p.add_argument("--episodes", type=int, default=o["episodes"], help="fresh starts")
-    p.add_argument("--only", default="", help="only cases whose label has this in it")
+    p.add_argument("--only", default="", help="only this case, or those with this in their names")
     p.add_argument("--list", action="store_true", help="name the cases and stop")
     p.add_argument("--runs", type=Path, default=Path("runs/experiments"), help="where runs go")
     p.add_argument("--results", type=Path, default=here, help="where tables and figures go")
@@ -103,6 +103,13 @@ def options(doc: str, **defaults: Any) -> argparse.Namespace:
     p.add_argument("--quick", action="store_true", help="two cases, two seeds, seconds")
     p.add_argument("--draw", action="store_true", help="only the figure, from the tables")
     return p.parse_args()
+
+
+def only(cases: Iterable[Case], args: argparse.Namespace) -> list[Case]:
+    """The case of the name asked for, or all that have it in their names."""
+    cases = list(cases)
+    exact = [case for case in cases if case.label == args.only]
+    return exact or [case for case in cases if args.only in case.label]
 
 
 def schedule(args: argparse.Namespace, **changes: Any) -> Schedule:
@@ -117,7 +124,7 @@ def experiment(
     draw: Callable[[argparse.Namespace, str], None] | None = None,
 ) -> None:
     """Train what is missing, measure it, and draw the figure from the tables."""
-    cases = [case for case in cases if args.only in case.label]
+    cases = only(cases, args)
     if args.list:
         print(*(case.label for case in cases), sep="\n")
         return

@@ -8,7 +8,19 @@ tree pursuit beside them; all from the same fresh starts.
 
 from collections import defaultdict
 
-from common import RADIUS, canvas, counted, estimate, measure, options, put, read, save, train
+from common import (
+    RADIUS,
+    canvas,
+    counted,
+    estimate,
+    measure,
+    only,
+    options,
+    put,
+    read,
+    save,
+    train,
+)
 from headline import cases
 
 from marlyap.certificates.robustness import moved
@@ -51,7 +63,7 @@ def perturbed(game, quick):
 
 def teams(args):
     """(name, seed, controller) of all that is to be disturbed."""
-    chosen = [case for case in cases(args) if args.only in case.label]
+    chosen = only(cases(args), args)
     if args.quick:
         chosen = [case.quick() for case in chosen[:1]]
     for case in chosen:
