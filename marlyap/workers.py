@@ -104,11 +104,13 @@ def _show(events: Iterable[dict[str, Any]], runs: list[Run]) -> None:
                 console.print(f"seed {e['seed']}: {what}", highlight=False)
                 continue
             first = seen.setdefault(e["seed"], e)
-            seconds = max(e["seconds"] - first["seconds"], 1e-9)
-            speed = (e["steps"] - first["steps"]) / seconds
+            if e["steps"] < first["steps"]:  # another run of the same seed
+                first = seen[e["seed"]] = e
+            seconds = e["seconds"] - first["seconds"]
+            speed = f"{(e['steps'] - first['steps']) / seconds:,.0f}/s  " if seconds > 0 else ""
             success = e.get("success", first.get("last"))
             first["last"] = success
-            text = f"{e['steps']:,} steps  {speed:,.0f}/s  return {e['return']:.2f}"
+            text = f"{e['steps']:,} steps  {speed}return {e['return']:.2f}"
             text += f"  success {100 * success:.1f} %" if success is not None else ""
             progress.update(
                 bars[e["seed"]], total=e["iterations"], completed=e["iteration"], text=text
