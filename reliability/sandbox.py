@@ -82,6 +82,6 @@ def run(place: Path, tests: list[str], limit: float = 600.0) -> tuple[str, float
     code = os.waitstatus_to_exitcode(status)
     tail = said.read_text(errors="replace").strip().splitlines()[-4:]
     verdict = "time" if killed else {0: "passed", 1: "failed"}.get(code, "failed")
-    if code not in (0, 1) and not killed and code != 2:
-        verdict = "broken"  # no test was run, or pytest itself failed
+    if code in (3, 4, 5):
+        verdict = "broken"  # no test was run, or pytest itself failed; killed by a signal is failed
     return verdict, usage.ru_utime + usage.ru_stime, "\n".join(tail)
