@@ -112,14 +112,14 @@ class Updates:
 def updates(
     game: AbstractGame, algorithm: AbstractAlgorithm, count: int, episodes: int = 64
 ) -> Updates:
-    """About `count` updates of `algorithm` from `episodes` random episodes, compiled."""
+    """`count` updates, a divisor of the horizon, from `episodes` random episodes, compiled."""
     trainer = Trainer(
         game,
         algorithm,
         Schedule(
             steps=episodes * game.horizon,
             environments=1,
-            steps_per_update=1,
+            steps_per_update=game.horizon // count,
             warmup=episodes * game.horizon,
             capacity=1,
         ),
@@ -161,7 +161,10 @@ class Product:
 
     @property
     def proper(self) -> bool:
-        """Not with a single row or column, as where a sum is written as a product with ones."""
+        """Not with a single row or column, as where a sum is written as a product with ones.
+
+        The last layer of a critic with one value for the team goes with them.
+        """
         (contract, other), (batch, beside) = self.axes
         free = lambda shape, gone: math.prod(n for i, n in enumerate(shape) if i not in gone)
         return min(free(self.left, contract + batch), free(self.right, other + beside)) > 1

@@ -200,8 +200,10 @@ def at_least(successes: int, trials: int, share: float, confidence: float) -> tu
 def share_of(
     certificate: Any, game: AbstractGame, seed: int, found: Found, steps: int
 ) -> tuple[float, bool, dict[str, Any]]:
-    """The bound on the share of rollouts that hold, whether it is as large as `certificate` asks,
-    and what every verdict on such a share says of it."""
+    """Bound on the share of rollouts that hold, whether it suffices, and a verdict's usual fields.
+
+    The bound is Clopper and Pearson's, at the share and the confidence that `certificate` asks for.
+    """
     n, k = len(found.holds), int(found.holds.sum())
     bound, shown = at_least(k, n, certificate.share, certificate.confidence)
     fields = {

@@ -30,16 +30,16 @@ def batch_last(forward: Forward) -> Forward:
 
     @rule.def_vmap
     def _(size: int, batched: list[PyTree], net: Any, x: PyTree) -> tuple[PyTree, PyTree]:
-        spread = lambda a, has: a if has else jnp.broadcast_to(a, (size, *a.shape))
+        repeated = lambda a, has: a if has else jnp.broadcast_to(a, (size, *a.shape))
         if any(jax.tree.leaves(batched[0])):
-            net = jax.tree.map(spread, net, batched[0])
-            # `matmul` knows of one axis that all share, the last: others are spread out.
+            net = jax.tree.map(repeated, net, batched[0])
+            # `matmul` knows of one axis that all share, the last: others are written out.
             stacked = max(w.ndim for w in jax.tree.leaves(net)) > 3
             if stacked or any(jax.tree.leaves(batched[1])):
-                x = jax.tree.map(spread, x, batched[1])
+                x = jax.tree.map(repeated, x, batched[1])
             y = rule(net, x)
         else:
-            x = jax.tree.map(spread, x, batched[1])
+            x = jax.tree.map(repeated, x, batched[1])
             columns = lambda a: jnp.moveaxis(a, 0, -1).reshape(*a.shape[1:-1], -1)
             rows = lambda a: jnp.moveaxis(a.reshape(*a.shape[:-1], -1, size), -1, 0)
             y = jax.tree.map(rows, forward(net, jax.tree.map(columns, x)))

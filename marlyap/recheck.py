@@ -181,7 +181,7 @@ class Simulator:
             raise UserError(f"recheck: V of kind {kind} is not known.")
         e, layers = e.reshape(*e.shape[:2], -1), self.layers("V/net.net")
         change = forward(layers, e) - forward(layers, np.zeros(e.shape[-1]))
-        return np.hypot.reduce(change, -1) + self.V["net"]["slope"] * np.hypot.reduce(e, -1)
+        return np.linalg.norm(change, axis=-1) + self.V["net"]["slope"] * np.linalg.norm(e, axis=-1)
 
 
 def frame(h: np.ndarray, v: np.ndarray) -> np.ndarray:

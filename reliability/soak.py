@@ -1,6 +1,6 @@
 """Training that is killed and resumed at random, against the same training left alone.
 
-    python reliability/soak.py [--minutes 120] [--seed 0]
+    python reliability/soak.py [--minutes 120] [--seed 0] [--out FILE]
 
 A child trains a tiny team, saving about once a second, and is ended by SIGKILL, SIGTERM or SIGINT
 after a random time, again and again. Then as many iterations are trained in one go, and every array
@@ -9,6 +9,7 @@ alone is read as it goes.
 """
 
 import argparse
+import json
 import os
 import random
 import signal
@@ -40,6 +41,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=120.0, help="of kills and resumes")
     parser.add_argument("--seed", type=int, default=0, help="of the times and signals")
+    parser.add_argument("--out", type=Path, default=None, help="JSON file")
     args = parser.parse_args()
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "soak"))
@@ -102,6 +104,12 @@ def main() -> int:
         growth = (max(sizes[-len(sizes) // 10 :]) - early) / 2**20
         print(f"{'equal' if same else 'DIFFERENT'} to the last bit in {len(alone)} arrays")
         print(f"memory {early / 2**20:.0f} MiB after a tenth, {growth:+.1f} MiB by the end")
+        if args.out:
+            found = {"minutes": args.minutes, "seed": args.seed, "iterations": saved.step}
+            found |= {"ends": {name: ends.count(name) for name in sorted(set(ends))}}
+            found |= {"damaged": warnings, "arrays": len(alone), "equal": same}
+            found |= {"memory_mib": round(early / 2**20, 1), "growth_mib": round(growth, 1)}
+            args.out.write_text(json.dumps(found, indent=1) + "\n")
     return int(not same)
 
 

@@ -138,5 +138,6 @@ def test_every_algorithm_finds_the_answers(name):
     assert np.mean(Q[BANDIT]) == pytest.approx(SCALE, rel=0.1)
     # Q = r / (1 - gamma): the time limit does not end the game.
     np.testing.assert_allclose(Q[CONSTANT], SCALE / (1 - GAMMA), rtol=0.06)
-    # Everyone comes as near to its goal as one step at full speed, 0.25 m, takes it.
-    assert np.mean(final[REACH]) < 0.3
+    # Everyone reaches its goal; deterministic policies may stop a step short, 0.25 m.
+    near = 0.25 if isinstance(algorithm, MADDPG) else Toy(KINDS[0]).radius
+    assert np.mean(final[REACH] <= near) > 0.9

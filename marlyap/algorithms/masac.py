@@ -5,6 +5,7 @@
     s_i (local)                    b.obs[i], b.next_obs[i]                   section 2.1
     pi_phi_1 ... pi_phi_N          pi                                        (5)
     a, a_{t+1} ~ pi_phi            now.action, nxt.action
+    (Gaussian noise of both draws) b.noise[:, 0], b.noise[:, 1]              (11)
     Q_theta^1, Q_theta^2           Q, returns both                           (6)
     Q_theta-bar                    Q_bar
     alpha, H-bar                   exp(log_alpha), agents * entropy          (12)
