@@ -81,7 +81,8 @@ class AbstractCertificate(eqx.Module):
         """Judge one controller. It does not raise when the controller fails."""
 
 
-Judge = Callable[[AbstractGame, AbstractLyapunov, Trajectory], Judgement]
+# The key is for what a certificate draws itself, such as one time of the rollout.
+Judge = Callable[[AbstractGame, AbstractLyapunov, Trajectory, Key], Judgement]
 
 
 @eqx.filter_jit
@@ -97,15 +98,22 @@ def _roll(
 
 @eqx.filter_jit
 def _judge(
-    judge: Judge, game: AbstractGame, V: AbstractLyapunov, seen: Trajectory, steps: int
+    judge: Judge,
+    game: AbstractGame,
+    V: AbstractLyapunov,
+    seen: Trajectory,
+    key: Key,
+    indices: Any,
+    steps: int,
 ) -> Judgement:
-    def one(trajectory: Trajectory) -> Judgement:
+    def one(trajectory: Trajectory, index: Array) -> Judgement:
         trajectory = until(trajectory, steps)
-        found, sound = judge(game, V, trajectory), finite(trajectory)
+        own = jax.random.fold_in(jax.random.fold_in(key, index), 2)
+        found, sound = judge(game, V, trajectory, own), finite(trajectory)
         badness = jnp.where(sound & ~jnp.isnan(found.badness), found.badness, jnp.inf)
         return Judgement(found.holds & sound, badness, found.figures)
 
-    return jax.vmap(one)(seen)
+    return jax.vmap(one)(seen, indices)
 
 
 def judged(
@@ -127,8 +135,10 @@ def judged(
     size = max(1, min(count, 1000, CHUNK // (game.agents * (long + 1))))
     key, parts = stream(seed, purpose), []
     for first in range(0, count, size):
-        seen = _roll(game, controller, key, np.arange(first, first + size), long)
-        parts.append(jax.tree.map(np.asarray, _judge(judge, game, V, seen, steps)))
+        indices = np.arange(first, first + size)
+        seen = _roll(game, controller, key, indices, long)
+        found = _judge(judge, game, V, seen, key, indices, steps)
+        parts.append(jax.tree.map(np.asarray, found))
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *map(vars, parts))
     return Found(**joined)
 

@@ -1,13 +1,10 @@
 """Every certificate of one controller, together: shared confidence, one file, fixed beforehand."""
 
 import dataclasses
-import hashlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
-import jax
 import numpy as np
 
 from marlyap import store
@@ -90,39 +87,15 @@ def save(
 ) -> None:
     """Store a result of `certify` with all that an independent checker needs.
 
-    That is the starts of the rollouts, the arrays of the controller and of V, and the graph.
+    That is the arrays of the controller and of V, and the graph; what was drawn at random follows
+    from the seed.
     """
     if policy_hash(controller) != result["policy"]:
         raise UserError("policy: this controller is not the one that was certified.")
     V = CostSum(controller=controller, ball=game.radius / 2) if V is None else V
-    count = max((c.get("rollouts", 0) for c in result["certificates"].values()), default=0)
-    arrays = {f"starts/{k}": v for k, v in starts(game, result["seed"], count).items()}
-    arrays |= {f"controller/{k}": v for k, v in named_arrays(controller).items()}
+    arrays = {f"controller/{k}": v for k, v in named_arrays(controller).items()}
     arrays["controller/words"] = words(controller)
     arrays |= {f"V/{k}": v for k, v in named_arrays(V).items()}
     arrays |= {"graph/slots": game.slots, "graph/linked": game.adjacency, "graph/leads": game.leads}
     arrays = {k: np.asarray(v) for k, v in arrays.items()}
-    meta = plain(dict(result)) | {"starts_sha256": starts_hash(arrays)}
-    store.write(Path(directory), KIND, arrays, meta, replace=replace)
-
-
-def starts_hash(arrays: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 of the bytes of the recorded starts."""
-    parts = (np.ascontiguousarray(arrays[k]).tobytes() for k in ("starts/x", "starts/goal"))
-    return hashlib.sha256(b"".join(parts)).hexdigest()
-
-
-@eqx.filter_jit
-def _starts(game: AbstractGame, key: jax.Array, indices: Any) -> tuple[jax.Array, jax.Array]:
-    def one(index):
-        k_start, _ = jax.random.split(jax.random.fold_in(key, index))
-        state = game.reset(k_start)
-        return state.x, state.goal
-
-    return jax.vmap(one)(indices)
-
-
-def starts(game: AbstractGame, seed: int, count: int) -> dict[str, np.ndarray]:
-    """The starts that the sampled certificates judge, in their order."""
-    x, goal = _starts(game, stream(seed, "certify"), np.arange(max(count, 1)))
-    return {"x": np.asarray(x), "goal": np.asarray(goal)}
+    store.write(Path(directory), KIND, arrays, plain(dict(result)), replace=replace)

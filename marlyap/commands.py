@@ -278,9 +278,10 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
 
 def recheck_certificate(args: Namespace, overrides: Overrides) -> Result:
     """`recheck`: reject the certificate or confirm its figures."""
-    result = recheck(args.certificate)
+    tell = (lambda name: None) if args.json else (lambda name: print(f"{name}: agrees", flush=True))
+    result = recheck(args.certificate, tell)
     if not args.json:
-        print(f"{args.certificate}: derived again, and agree: {', '.join(result['rechecked'])}.")
+        print(f"{args.certificate}: derived again, {len(result['rechecked'])} certificates agree.")
         if result["not_rechecked"]:
             print(f"Not looked at: {', '.join(result['not_rechecked'])}.")
     return result, 0

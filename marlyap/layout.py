@@ -48,6 +48,11 @@ def batch_last(forward: Forward) -> Forward:
     return rule
 
 
+def grad(f: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """`jax.grad` at one sample of a function with networks in it: as a batch of one."""
+    return lambda x: jax.grad(lambda xs: jnp.sum(jax.vmap(f)(xs)))(x[None])[0]
+
+
 def rows_as_columns(forward: Forward) -> Forward:
     """One net for a whole stack: arrays [*stack, row, in, batch] pass through it as columns."""
 

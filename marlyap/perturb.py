@@ -12,6 +12,7 @@ from marlyap import graph as graphs
 from marlyap.dynamics import AbstractDynamics
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
+from marlyap.seeds import branch
 from marlyap.types import State
 
 
@@ -89,7 +90,7 @@ class Perturbed(AbstractGame):
         if start.memory is not None:
             raise UserError("perturbation: this game keeps a memory of its own; perturb it inside.")
         x = start.x.at[:, :2].multiply(self.spread)
-        seed = jax.random.key_data(jax.random.fold_in(key, 1))
+        seed = jax.random.key_data(branch(key, "perturb"))
         queue = jnp.zeros((self.delay, self.agents, self.dynamics.du))
         return State(x=x, goal=start.goal, t=start.t, memory={"seed": seed, "queue": queue})
 

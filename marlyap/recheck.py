@@ -1,12 +1,14 @@
 """An independent checker of certificates: NumPy in float64, and nothing of what made them.
 
-It integrates the recorded starts again, evaluates observations, networks and V on its own from the
-recorded arrays, counts again, and computes the exact bounds by bisection on the binomial tail. What
-it cannot derive (random disturbances, proofs) it lists; what differs it rejects.
+From the recorded seed it draws starts, disturbances and times anew, by a generator of its own; it
+integrates, and evaluates observations, networks and V from the recorded arrays; it counts again,
+and computes the exact bounds by bisection on the binomial tail. What differs it rejects. What no
+rollout can show it lists: proofs, and constants taken from the rollouts that calibrate.
 """
 
-import hashlib
 import math
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,30 +18,33 @@ from marlyap import store
 from marlyap.errors import UserError
 
 
-KNOWN = ("Unicycle", "DoubleIntegrator", "SingleIntegrator")
+KNOWN = {"Unicycle": 5, "DoubleIntegrator": 4, "SingleIntegrator": 2}  # numbers in a state
 CLOSE = 2e-3  # relative to the threshold: a rollout this near to it may fall on either side
+MOST = 10**9  # agent-steps of the longest set of rollouts that is played
+GRID = np.linspace(-6.0, 6.0, 20_001)  # of standard normal numbers, and their distribution
+BELOW = np.array([(1 + math.erf(z / math.sqrt(2))) / 2 for z in GRID])
 
 
 class Rejected(UserError):
     """The file does not say what its own starts and arrays give."""
 
 
-def recheck(path: Path | str) -> dict[str, Any]:
+def recheck(path: Path | str, tell: Callable[[str], None] = lambda name: None) -> dict[str, Any]:
     """Derive every sampled figure anew. Returns what agreed and what was not looked at.
+
+    `tell` hears of each certificate as soon as its figures agree.
 
     Raises Rejected (a UserError) at the first figure that differs and for a file that is no
     certificate, and UserError for one that is damaged or about a game this checker does not know.
     """
     try:
-        return derive(*store.read(Path(path), "certificate"))
+        return derive(*store.read(Path(path), "certificate"), tell)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         what = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".")
         raise Rejected(f"{path} is no certificate ({what}); use another copy of it.") from error
 
 
-def derive(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> dict[str, Any]:
-    starts = b"".join(arrays[f"starts/{k}"].tobytes() for k in ("x", "goal"))
-    agree("the hash of the starts", hashlib.sha256(starts).hexdigest(), meta["starts_sha256"])
+def derive(arrays: dict, meta: dict, tell: Callable[[str], None]) -> dict[str, Any]:
     own = store.hash_arrays({k[11:]: v for k, v in arrays.items() if k.startswith("controller/")})
     agree("the hash of the policy", own, meta["policy"])
     verdicts, sim = meta["verdicts"], Simulator(meta, arrays)
@@ -49,13 +54,47 @@ def derive(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> dict[str, Any
     for name in sampled:
         near("the confidence", verdicts[name]["confidence"], 1 - tail, 1e-12)
         worst, check = verdicts[name]["worst"], CHECKS.get(verdicts[name]["name"])
-        if worst is not None and not worst.get("change", {}).get("spread"):
-            start = arrays["starts/x"][worst["episode"]].tolist()
-            agree(f"the worst start of {name}", start, worst["state"]["x"])
+        if worst is not None:
+            x = sim.starts(worst["episode"])[0][0]
+            x[..., :2] *= worst.get("change", {}).get("spread", 1.0)
+            far = np.abs(x - worst["state"]["x"]).max() / (1 + sim.game["size"])
+            near(f"the distance of {name}'s worst start from the one drawn", far, 0.0, 1e-4)
         if check is not None:
             done[name] = check(sim, verdicts[name], meta["certificates"][name], tail)
+            tell(name)
         left += [name] if check is None else done[name].pop("left", [])
     return {"agrees": True, "rechecked": done, "not_rechecked": left}
+
+
+def threefry(key: Any, high: Any, low: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Threefry-2x32 in 20 rounds (Salmon et al., 2011), which the seeds of the file are meant for.
+
+    A key is a pair of arrays of 32-bit words, one for each stream.
+    """
+    keys = (*key, key[0] ^ key[1] ^ np.uint32(0x1BD11BDA))
+    a, b = keys[0] + high, keys[1] + low
+    for i in range(5):
+        for r in ((13, 15, 26, 6), (17, 29, 16, 24))[i % 2]:
+            a = a + b
+            b = a ^ (b << np.uint32(r) | b >> np.uint32(32 - r))
+        a, b = a + keys[(i + 1) % 3], b + keys[(i + 2) % 3] + np.uint32(i + 1)
+    return a, b
+
+
+def fold(key: Any, number: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Other streams, one for each number."""
+    return threefry(key, np.uint32(0), np.asarray(number, np.uint32))
+
+
+def uniform(key: Any, *shape: int) -> np.ndarray:
+    """Numbers in [0, 1) from every stream [stream, *shape], in float32."""
+    a, b = fold([word[:, None] for word in key], np.arange(math.prod(shape)))
+    bits = (a ^ b) >> np.uint32(9) | np.uint32(0x3F800000)
+    return (bits.view(np.float32) - 1).reshape(-1, *shape)
+
+
+def normal(key: Any, *shape: int) -> np.ndarray:
+    return np.interp(uniform(key, *shape) + 2.0**-25, BELOW, GRID)
 
 
 def mass(n: int, p: float) -> np.ndarray:
@@ -87,7 +126,7 @@ class Simulator:
 
     def __init__(self, meta: dict[str, Any], arrays: dict[str, np.ndarray]):
         self.game, self.controller, self.V = meta["game"], meta["controller"], meta["V"]
-        self.arrays, self.cache = arrays, {}
+        self.arrays, self.cache, self.seed = arrays, {}, meta["seed"]
         model = self.game.get("dynamics", {})
         self.kind, self.limits = model.get("kind"), np.array(model.get("limits", []))
         world = self.game["kind"], self.controller["kind"], model.get("integrator")
@@ -97,29 +136,53 @@ class Simulator:
             raise UserError(f"recheck: only {known} is known, not {world} of {self.kind}.")
         self.slots, self.leads = arrays["graph/slots"], arrays["graph/leads"]
 
-    def roll(self, n: int, steps: int, change: dict[str, Any]) -> dict[str, np.ndarray]:
+    def keys(self, episodes: Any) -> tuple[np.ndarray, np.ndarray]:
+        """One stream per episode of those that certify."""
+        seed = np.zeros(1, np.uint32), np.array([self.seed], np.uint32)
+        return fold(fold(seed, zlib.crc32(b"certify")), np.atleast_1d(episodes))
+
+    def starts(self, episodes: Any) -> tuple[np.ndarray, np.ndarray, Any]:
+        """States [episode, agent, .], goals, and the stream of each episode's disturbances."""
+        key, size = fold(self.keys(episodes), 0), self.game["size"]
+        draw = lambda i, *shape: 2.0 * uniform(fold(key, i), *shape) - 1
+        x = np.zeros((len(key[0]), len(self.slots), KNOWN[self.kind]))
+        x[..., :2] = size * draw(0, len(self.slots), 2)
+        if self.kind == "Unicycle":
+            x[..., 2] = np.pi * draw(1, len(self.slots))
+        goal = np.repeat(size * draw(2, 2)[:, None], len(self.slots), axis=1)
+        return x, goal, fold(key, zlib.crc32(b"perturb"))
+
+    def roll(self, n: int, steps: int, change: dict[str, Any]) -> dict[str, Any]:
         """States [n, steps + 1, agent, .] and distances, from the first n starts."""
-        if (name := (n, steps, repr(change))) in self.cache:
-            return self.cache[name]
-        x, goal = (self.arrays[f"starts/{k}"][:n].astype(float) for k in ("x", "goal"))
+        if (name := (n, steps, repr(change))) not in self.cache:
+            if not 0 <= n * steps * len(self.slots) <= MOST:
+                raise Rejected(f"certificate: {n} rollouts of {steps} steps are too many to check.")
+            self.cache = {name: self.drive(*self.starts(np.arange(n)), steps, change)}
+        return self.cache[name]
+
+    def drive(self, x: Any, goal: Any, key: Any, steps: int, change: Any) -> dict[str, Any]:
         x[..., :2] *= change.get("spread", 1.0)
+        noise, drop = change.get("noise", 0.0), np.float32(change.get("drop", 0.0))
         linked, present = self.arrays["graph/linked"].copy(), np.ones(x.shape[1], bool)
         present[list(change.get("gone", []))] = False
         linked &= present[:, None] & present[None, :]
         for a, b in change.get("cut", []):
             linked[[a, b], [b, a]] = False
-        queue, seen = [np.zeros((*x.shape[:2], len(self.limits)))] * change.get("delay", 0), [x]
+        shape = x.shape[1], len(self.limits)
+        queue, seen = [np.zeros((len(x), *shape))] * change.get("delay", 0), [x]
         limits = change.get("gain", 1.0) * self.limits
         with np.errstate(all="ignore"):
-            for _ in range(steps):
-                queue.append(self.act(x, goal, linked))
-                x = self.step(x, limits * np.clip(queue.pop(0), -1, 1))
+            for t in range(steps):
+                lost = drop > 0 and uniform(fold(fold(key, 1), t), *linked.shape) < drop
+                queue.append(self.act(x, goal, linked & ~np.asarray(lost)))
+                u = queue.pop(0)
+                u = u + noise * normal(fold(fold(key, 2), t), *shape) if noise else u
+                x = self.step(x, limits * np.clip(u, -1, 1))
                 seen.append(x)
         states = np.stack(seen, axis=1)
         distance = np.linalg.norm(states[..., :2] - goal[:, None], axis=-1) * present
         sound = np.isfinite(states).all(axis=(1, 2, 3))
-        self.cache = {name: {"x": states, "goal": goal, "distance": distance, "sound": sound}}
-        return self.cache[name]
+        return {"x": states, "goal": goal, "distance": distance, "sound": sound}
 
     def step(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         dt, x = self.game["dt"], x.copy()
@@ -147,7 +210,7 @@ class Simulator:
             to_goal = flag * frame(h[:, i], goal[:, i] - p[:, i])
             row = [rates[:, i], flag, to_goal, magnified(to_goal, self.game["radius"])]
             for j in slots:
-                gap, there = frame(h[:, i], p[:, j] - p[:, i]), float(j >= 0 and linked[i, j])
+                gap, there = frame(h[:, i], p[:, j] - p[:, i]), (j >= 0) * linked[..., i, j, None]
                 sight = [1 + 0 * flag, gap, magnified(gap, self.game["radius"])]
                 sight += [frame(h[:, i], of[:, j]) for of in (v, h)[: 1 + self.game["headings"]]]
                 row += [there * part for part in sight]
@@ -286,14 +349,51 @@ def quantiles(sim: Simulator, v: dict, c: dict, tail: float) -> dict[str, Any]:
 
 def robustness(sim: Simulator, v: dict, c: dict, tail: float) -> dict[str, Any]:
     curve, out = v["figures"]["curve"], {}
-    chance = [p for p in curve if {"noise", "drop"} & {*p["change"]}]
-    for point in (p for p in curve if p not in chance):
+    for point in curve:
         seen = sim.roll(c["rollouts"], sim.game["horizon"], point["change"])
         said = point | {"name": point["perturbation"], "figures": {"share_asked": c["share"]}}
         worse, part = seen["distance"][:, -1].max(axis=1), tail / len(curve)
         out[said["name"]] = counted(said, worse, sim.game["radius"], seen["sound"], part)
-    return {"curve": out, "left": [f"robustness: {p['perturbation']}" for p in chance]}
+    return {"curve": out}
+
+
+def composition(sim: Simulator, v: dict, c: dict, tail: float) -> dict[str, Any]:
+    T, said = c["T"], v["figures"]
+    seen = sim.roll(c["rollouts"], sim.game["horizon"] + c["stay"] + T, {})
+    M, delta = (np.array(said[k], float) for k in ("M", "delta"))
+    V = np.lib.stride_tricks.sliding_window_view(seen["distance"], T, axis=1).max(axis=-1)
+    excess = (V[:, T:] - V[:, :-T] @ M.T - delta).max(axis=(1, 2))
+    if fitted := bool(np.isfinite(M).all()):
+        near("the spectral radius", np.abs(np.linalg.eigvals(M)).max(), said["rho"], 1e-6)
+        ultimate = np.abs(np.linalg.solve(np.eye(len(M)) - M, delta) - said["ultimate"]).max()
+        near("the distance to the ultimate bound said", ultimate, 0.0, 1e-6)
+    within = sim.game["radius"] if c["within"] is None else c["within"]
+    if v["holds"] and not (fitted and said["rho"] < 1 and max(said["ultimate"]) <= within):
+        raise Rejected("certificate: composition does not hold by its bounds, as the file says.")
+    return counted(v, excess, 0.0, seen["sound"], tail, scale=1e-2)
+
+
+def theorem1(sim: Simulator, v: dict, c: dict, tail: float) -> dict[str, Any]:
+    n, H, said = c["rollouts"], sim.game["horizon"], v["figures"]
+    if c["old"] is not None:
+        return {"left": ["theorem1: its tuples, of another policy"]}
+    seen, beyond, pick = sim.roll(n, H, {}), sim.V.get("T") or 0, np.arange(n)
+    key = fold(sim.keys(pick), 2)
+    t = (H * uniform(fold(key, 0))).astype(int)
+    x, goal = seen["x"][pick, t], seen["goal"]
+    new = sim.act(x, goal, sim.arrays["graph/linked"])
+    old = np.clip(new + c["noise"] * normal(fold(key, 1), *new.shape[1:]), -1, 1)
+    go = lambda x: sim.values(sim.drive(x, goal, key, beyond, {}), 1)[:, 0]
+    V, after = go(x.copy()), go(sim.step(x, sim.limits * old))
+    moved = np.linalg.norm((new - old) * sim.limits, axis=(1, 2))
+    dt, orders = sim.game["dt"], (KNOWN[sim.kind] + 1) // 2  # 1, 2 and 3
+    l_f = math.hypot(*[dt, dt**2, dt**3 * said["speed"]][:orders])
+    near("l_f", l_f, said["l_f"], 1e-5)
+    excess = after + said["l_L"] * l_f * moved - (1 - c["rate"]) * V
+    pick = seen["distance"][pick, t].max(axis=1) > sim.game["radius"]
+    found = counted(v, excess[pick], 0.0, seen["sound"][pick], tail, scale=1e-2)
+    return found | {"left": ["theorem1: l_L and the speed in l_f, which come from other rollouts"]}
 
 
 CHECKS = {f.__name__: f for f in (reach, decrease, contraction, basin, quantiles, robustness)}
-CHECKS["reach-and-stay"] = reach
+CHECKS |= {"reach-and-stay": reach, "composition": composition, "theorem1": theorem1}

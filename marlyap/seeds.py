@@ -24,4 +24,9 @@ def stream(seed: int, purpose: Purpose) -> Key:
     Raises UserError unless 0 <= seed < 2^31.
     """
     check(seed)
-    return jax.random.fold_in(jax.random.key(seed), zlib.crc32(purpose.encode()))
+    return branch(jax.random.key(seed), purpose)
+
+
+def branch(key: Key, purpose: Purpose) -> Key:
+    """A stream that branches off from `key` for one purpose, and meets none of its splits."""
+    return jax.random.fold_in(key, zlib.crc32(purpose.encode()))

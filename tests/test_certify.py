@@ -68,8 +68,9 @@ def test_it_says_each_verdict_and_does_not_flatter(certified):
 def test_it_agrees_with_itself_and_says_what_it_left_out(run, certified, capsys):
     code, out, line = said(capsys, "recheck", run.directory / "certificate")
     assert code == 0, line
-    derived, left = out.strip().splitlines()
-    assert "agree: reach, basin, quantiles" in derived and "linearisation" in left
+    *agree, derived, left = out.strip().splitlines()
+    assert agree == [f"{name}: agrees" for name in ("reach", "basin", "quantiles")]
+    assert "3 certificates agree" in derived and "linearisation" in left
 
 
 def test_the_report_has_the_claims_the_worst_starts_and_the_slices_of_V(page, certified):

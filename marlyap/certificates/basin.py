@@ -72,9 +72,9 @@ class Basin(AbstractCertificate):
             },
         )
 
-    def judge(self, game, V, trajectory):
+    def judge(self, game, V, trajectory, key):
         seen = until(trajectory, game.horizon + self.stay)
-        found = ReachAndStay(stay=self.stay).judge(game, V, seen)
+        found = ReachAndStay(stay=self.stay).judge(game, V, seen, key)
         value = V.along(game, trajectory, 1)[0]
         return Judgement(found.holds, found.badness, {"V": value})
 

@@ -107,7 +107,7 @@ class _Windows(eqx.Module):
 
     T: int
 
-    def __call__(self, game, V, trajectory) -> Judgement:
+    def __call__(self, game, V, trajectory, key) -> Judgement:
         distance = jax.vmap(game.distance)(trajectory.state)
         time = distance.shape[0] - self.T + 1
         window = jnp.arange(time)[:, None] + jnp.arange(self.T)[None, :]

@@ -71,7 +71,7 @@ class Contraction(AbstractCertificate):
     def floor(self, game) -> float:
         return game.radius if self.c_min is None else self.c_min
 
-    def judge(self, game, V, trajectory):
+    def judge(self, game, V, trajectory, key):
         c = jnp.mean(trajectory.cost, axis=1)
         now, ahead = c[: game.horizon - self.T + 1], c[self.T : game.horizon + 1]
         asked = now >= self.floor(game)

@@ -55,7 +55,7 @@ class Decrease(AbstractCertificate):
             },
         )
 
-    def judge(self, game, V, trajectory):
+    def judge(self, game, V, trajectory, key):
         H = game.horizon
         inside = jax.vmap(game.success)(jax.tree.map(lambda leaf: leaf[: H + 1], trajectory.state))
         before = jnp.cumsum(inside[:-1]) == 0  # t < tau

@@ -70,7 +70,7 @@ class Quantiles(AbstractCertificate):
             figures={"q": self.q, "bounds": bounds, "V": type(V).__name__},
         )
 
-    def judge(self, game, V, trajectory):
+    def judge(self, game, V, trajectory, key):
         H = game.horizon
         states = jax.tree.map(lambda leaf: leaf[: H + 1], trajectory.state)
         distance = jnp.max(jax.vmap(game.distance)(states), axis=1)

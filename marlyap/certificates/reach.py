@@ -43,7 +43,7 @@ class Reach(AbstractCertificate):
             figures={"share_asked": self.share},
         )
 
-    def judge(self, game, V, trajectory):
+    def judge(self, game, V, trajectory, key):
         last = jax.tree.map(lambda leaf: leaf[-1], trajectory.state)
         distance = jnp.max(game.distance(last))
         return Judgement(game.success(last), distance, {"final_distance": distance})
@@ -78,7 +78,7 @@ class ReachAndStay(AbstractCertificate):
             figures={"share_asked": self.share, "stay_steps": self.stay},
         )
 
-    def judge(self, game, V, trajectory):
+    def judge(self, game, V, trajectory, key):
         late = jax.tree.map(lambda leaf: leaf[game.horizon :], trajectory.state)
         farthest = jnp.max(jax.vmap(game.distance)(late))
         inside = jnp.all(jax.vmap(game.success)(late))

@@ -20,6 +20,7 @@ from marlyap.certificate import (
 )
 from marlyap.dynamics import AbstractDynamics, Unicycle
 from marlyap.game import AbstractGame
+from marlyap.layout import grad
 from marlyap.lyapunov_function import Norm
 from marlyap.rollout import Controller
 
@@ -101,17 +102,15 @@ class _Tuple(eqx.Module):
     old: Controller | None
     noise: float
 
-    def __call__(self, game, V, trajectory) -> Judgement:
-        bits = jax.lax.bitcast_convert_type(trajectory.state.x[0].ravel(), jnp.int32)
-        key = jax.random.fold_in(jax.random.key(0), jnp.sum(bits))
+    def __call__(self, game, V, trajectory, key) -> Judgement:
         k_time, k_noise = jax.random.split(key)
-        t = jax.random.randint(k_time, (), 0, game.horizon)
+        t = (game.horizon * jax.random.uniform(k_time)).astype(int)
         state = jax.tree.map(lambda leaf: leaf[t], trajectory.state)
         new = self.new(state, jax.random.key(0))
         noisy = new + self.noise * jax.random.normal(k_noise, new.shape)
         old = jnp.clip(noisy if self.old is None else self.old(state, jax.random.key(0)), -1.0, 1.0)
         scale = jnp.asarray(game.dynamics.limits)[None]
-        gradient = jax.grad(lambda x: V.value(game, eqx.tree_at(lambda s: s.x, state, x)))(state.x)
+        gradient = grad(lambda x: V.value(game, eqx.tree_at(lambda s: s.x, state, x)))(state.x)
         velocity = jax.vmap(game.dynamics.velocity)(state.x)
         speed = jnp.max(jnp.linalg.norm(velocity, axis=1)) + game.dt * jnp.max(scale)
         figures = {
