@@ -151,7 +151,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(json.dumps(result))
         return code
     except UserError as error:
-        print(f"marlyap: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"marlyap: {error}", file=sys.stderr)
         return 2
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -4,8 +4,13 @@
 class UserError(Exception):
     """Bad input. The message is one sentence that names the field and the mend.
 
-    The command line prints it on standard error and exits with code 2, without a traceback.
+    The command line prints it on standard error and exits with code 2, without a traceback. It is
+    one line whatever was quoted in it, and nothing in it moves a terminal's cursor.
     """
+
+    def __str__(self) -> str:
+        visible = "".join(c if c.isprintable() else " " for c in super().__str__())
+        return " ".join(visible.split())
 
 
 def within(

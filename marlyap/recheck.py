@@ -40,7 +40,7 @@ def recheck(path: Path | str, tell: Callable[[str], None] = lambda name: None) -
     try:
         return derive(*store.read(Path(path), "certificate"), tell)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        what = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".")
+        what = f"{type(error).__name__}: {error}".rstrip(".")
         raise Rejected(f"{path} is no certificate ({what}); use another copy of it.") from error
 
 

@@ -222,6 +222,11 @@ def test_the_process_exits_with_2_and_no_traceback(argv, tmp_path):
     assert done.stderr.startswith("marlyap: ") and done.stderr.count("\n") == 1
 
 
+def test_what_is_quoted_in_a_message_cannot_break_its_line(capsys):
+    code, out, line = call(capsys, *TRAIN, "--task.graph", "a\nb\x1b[2J")
+    assert code == 2 and out == "" and line.count("\n") == 1 and "\x1b" not in line
+
+
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_said(tmp_path):
     command = [sys.executable, "-m", "marlyap", *TRAIN, "--device", "gpu", *TINY]

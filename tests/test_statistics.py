@@ -199,6 +199,7 @@ def test_wilson_covers_near_nominal():
         (1, math.nan, "trials must be whole"),
         (1, math.inf, "trials must be whole"),
         (1.5, 10, "successes must be whole"),
+        ([1.0, 1.5], 10, "successes must be whole"),
         ("3", 10, "successes must be whole"),
         (True, 10, "successes must be whole"),
         (np.array([1, 2, 11]), 10, "between 0 and trials"),
