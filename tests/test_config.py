@@ -14,8 +14,8 @@ from marlyap.constraints import CONSTRAINTS, Lyapunov
 from marlyap.dynamics import DYNAMICS, DoubleIntegrator, Unicycle
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
-from marlyap.tasks import TASKS, Rendezvous
 from marlyap.run import Run
+from marlyap.tasks import TASKS, Rendezvous
 from marlyap.trainer import SCHEDULES, Schedule, Trainer
 
 
