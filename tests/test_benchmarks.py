@@ -13,6 +13,7 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
 SCRIPTS = sorted(p.stem for p in FOLDER.glob("*.py") if p.stem not in ("harness", "peer_benchmarl"))
 COLUMNS = {
     "agents": {"agents", "updates/s", "growth"},
+    "checkpoint": {"agents", "transitions", "save s", "share %"},
     "environment": {"agents", "environments", "steps/s"},
     "memory": {"agents", "peak MB"},
     "peer": {"agents", "who", "steps and updates/s"},
@@ -36,7 +37,7 @@ def benchmarks(monkeypatch):
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("agents", "peer", "startup")]
 
 
-@pytest.mark.parametrize("name", ["environment", "update", *SLOW])
+@pytest.mark.parametrize("name", ["checkpoint", "environment", "update", *SLOW])
 @pytest.mark.usefixtures("quick_compilation")
 def test_quick(name, benchmarks, tmp_path, capsys):
     benchmarks(name)["main"](["--quick", "--out", str(tmp_path)])
