@@ -24,6 +24,7 @@ import pytest
 from marlyap import store, workers
 from marlyap.algorithms import ALGORITHMS, MASAC
 from marlyap.cli import main
+from marlyap.constraints import Lyapunov
 from marlyap.dynamics import SingleIntegrator
 from marlyap.errors import UserError
 from marlyap.fit import Diverged, advance, fit
@@ -49,8 +50,14 @@ SINGLE, PAIR = (5,), (5, 6)
 
 
 def trainer(name, schedule=SCHEDULE):
-    small = dict(actor_width=4, critic_width=4, batch=4)
-    return Trainer(GAME, dataclasses.replace(ALGORITHMS[name], **small), schedule)
+    """A tiny one; `name` may go on with a reading of the Lyapunov constraint, after a colon."""
+    name, _, reading = name.partition(":")
+    algorithm, small = ALGORITHMS[name], dict(actor_width=4, critic_width=4, batch=4)
+    small = {field: size for field, size in small.items() if hasattr(algorithm, field)}
+    if reading:
+        function = "norm" if reading == "score" else "squares"
+        small["constraint"] = Lyapunov(reading=reading, function=function)
+    return Trainer(GAME, dataclasses.replace(algorithm, **small), schedule)
 
 
 def runs_in(place, name, seeds):
@@ -137,6 +144,24 @@ def test_a_stopped_run_ends_bit_for_bit_like_an_uninterrupted_one(
         assert final(run) == whole
         assert [line["iteration"] for line in run.history()] == [1, 2, 3, 4, 5, 6]
         assert run.finished
+
+
+EACH = sorted({*ALGORITHMS} - {"masac", "masac-lyapunov"})
+EACH += [f"masac-lyapunov:{reading}" for reading in ("literal", "hinge", "score")]
+QUICK = ("apg", "matd3")
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in EACH]
+)
+@pytest.mark.usefixtures("quick_compilation")
+def test_each_algorithm_and_each_reading_resumes_bit_for_bit(name, uninterrupted, tmp_path):
+    """Cut in mid-decay, when the memory has just been overwritten."""
+    (run,) = runs_in(tmp_path, name, SINGLE)
+    list(fit([run], until(5)))
+    assert run.checkpoints.latest().step == 5
+    list(fit([Run.open(run.directory)]))
+    assert [final(run)] == uninterrupted(name, SINGLE)
 
 
 def test_the_whole_state_is_in_the_checkpoint(uninterrupted):
