@@ -3,6 +3,7 @@
 The reference networks below are per sample and per agent; with xp=np they run in float64.
 """
 
+import math
 from dataclasses import replace
 
 import equinox as eqx
@@ -14,6 +15,7 @@ import pytest
 from conftest import close, filled, level, same
 from scipy import stats
 
+from marlyap.algorithms import MASAC
 from marlyap.constraint import Unconstrained
 from marlyap.constraints.lyapunov import Certificate, Lyapunov
 from marlyap.errors import UserError
@@ -366,6 +368,97 @@ def test_rates_decay_together_and_are_those_asked_for(masac, learner, batch, upd
         assert moves[name, 0.0] == 0, name
         assert moves[name, 1.0] == pytest.approx(rate, rel=2e-2), name  # Adam's first step
         assert moves[name, 0.5] == pytest.approx(0.5 * rate, rel=2e-2), name
+
+
+def test_what_an_update_tells_the_log(masac, learner, batch, drawn):
+    log_prob = np.asarray(drawn[0].log_prob)
+    after, info = update(masac, learner, batch, jnp.ones(()))
+    rises = jax.vmap(lambda b, a: masac.constraint.rise(learner.L, b, a))(batch, drawn[1].action)
+    rises, info = np.asarray(rises), {name: float(x) for name, x in info.items()}
+    assert info["entropy"] == pytest.approx(-np.mean(np.sum(log_prob, axis=1)), rel=1e-4)
+    assert info["alpha"] == pytest.approx(math.exp(after.log_alpha.value), rel=1e-5)
+    assert info["weight"] == pytest.approx(math.exp(learner.L.log_weight.value), rel=1e-5)
+    assert info["rise"] == pytest.approx(np.mean(rises), rel=1e-4)
+    scale = 0.99 * float(learner.L.scale) + 0.01 * np.var(rises)
+    assert float(after.L.scale) == pytest.approx(scale, rel=1e-4)
+    assert {"J_Q", "J_pi", "J_L"} <= info.keys() and np.isfinite([*info.values()]).all()
+
+
+def test_the_weight_rises_by_what_is_outside_the_ball(masac, learner, batch, drawn):
+    """With no transition outside, it rests: nothing is divided by zero."""
+    costs = np.mean(batch.cost, axis=1)
+    nxt = drawn[1]
+    for ball in (float(np.median(costs)), float(np.max(costs))):
+        constraint = replace(masac.constraint, ball=ball)
+        L, info = eqx.filter_jit(constraint.update)(learner.L, batch, *drawn, jnp.ones(()))
+        rises = jax.vmap(lambda b, a: masac.constraint.rise(learner.L, b, a))(batch, nxt.action)
+        outside = np.asarray(rises)[costs > ball]
+        assert info["rise"] == pytest.approx(outside.mean() if len(outside) else 0.0, rel=1e-4)
+        moved = float(L.log_weight.value - learner.L.log_weight.value)
+        assert len(outside) or moved == 0
+
+
+def test_a_constraint_begins_as_asked(shape):
+    L = Lyapunov(weight_start=0.25, floor=0.1).init(shape, jax.random.key(0))
+    assert np.exp(L.log_weight.value) == pytest.approx(0.25) and L.gradient == L.scale == 1
+    net, net_bar = (jax.tree.leaves(eqx.filter(n, eqx.is_array)) for n in (L.net.value, L.net_bar))
+    assert all(np.array_equal(a, b) for a, b in zip(net, net_bar, strict=True))
+
+
+@pytest.mark.parametrize("critic", ["joint", "mean-field"])
+@pytest.mark.parametrize("heads", ["team", "agent"])
+def test_the_critics_have_the_heads_asked_for(heads, critic, shape, batch):
+    algorithm = MASAC(heads=heads, critic=critic, actor_width=4, critic_width=4)
+    l = jax.jit(lambda key: algorithm.init(shape, key))(jax.random.key(0))
+    b = jax.tree.map(lambda a: a[0], batch)
+    said = jax.eval_shape(l.Q.value, b.features, b.action)
+    assert said.shape == (2, 1 if heads == "team" else shape.agents)
+    team = algorithm.team(b.reward)
+    wanted = b.reward if heads == "agent" else [np.mean(b.reward)]
+    assert np.allclose(team, wanted, rtol=1e-6) and team.shape == said.shape[1:]
+
+
+OPEN = {  # field: what is just allowed, and what is just not
+    MASAC: {
+        "gamma": ([0.0, 1.0], [-1e-9, 1.000001]),
+        "tau": ([1e-9, 1.0], [0.0, 1.000001]),
+        "average": ([1e-9, 1.0], [0.0, 1.000001]),
+        "rate_pi": ([0.0, 1.0], [-1e-9, 1.000001]),
+        "rate_Q": ([0.0, 1.0], [-1e-9, 1.000001]),
+        "rate_alpha": ([0.0, 1.0], [-1e-9, 1.000001]),
+        "alpha": ([1e-9, 1e6], [0.0, 1e6 + 0.5]),
+        "reward_scale": ([1e-9, 1e6], [0.0, 1e6 + 0.5]),
+        "batch": ([1, 1_000_000], [0, 1_000_001]),
+        "n_step": ([1, 1_000_000], [0, 1_000_001]),
+        "actor_width": ([1, 1_000_000], [0, 1_000_001]),
+        "critic_width": ([1, 1_000_000], [0, 1_000_001]),
+    },
+    Lyapunov: {
+        "horizon": ([1, 10_000], [0, 10_001]),
+        "discount": ([0.0, 1.0], [-1e-9, 1.000001]),
+        "decrease": ([0.0, 1.0], [-1e-9, 1.000001]),
+        "tau": ([1e-9, 1.0], [0.0, 1.000001]),
+        "weight_start": ([1e-9, 1e6], [0.0, 1e6 + 0.5]),
+        "floor": ([1e-9, 1e6], [0.0, 1e6 + 0.5]),
+        "input_gain": ([1e-9, 1e6], [0.0, 1e6 + 0.5]),
+        "ball": ([0.0, 1e6], [-1e-9, 1e6 + 0.5]),
+        "clip": ([0.0, 1e6], [-1e-9, 1e6 + 0.5]),
+        "rate_L": ([0.0, 1e6], [-1e-9, 1e6 + 0.5]),
+        "rate_weight": ([0.0, 1e6], [-1e-9, 1e6 + 0.5]),
+        "weight": ([None, 0.0, 1e6], [-1e-9, 1e6 + 0.5]),
+        "slope": (["empirical", 0.0, 1e6], [-1e-9, 1e6 + 0.5]),
+    },
+}
+
+
+@pytest.mark.parametrize("kind", [*OPEN], ids=lambda kind: kind.__name__)
+def test_the_ranges_of_hyperparameters(kind):
+    for field, (fine, bad) in OPEN[kind].items():
+        for value in fine:
+            assert getattr(kind(**{field: value}), field) == value
+        for value in bad:
+            with pytest.raises(UserError, match=f"^{field}: "):
+                kind(**{field: value})
 
 
 def test_the_weight_stays_between_its_floor_and_one(masac, learner, batch):
