@@ -17,6 +17,7 @@ import io
 import json
 import re
 import shutil
+import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -106,10 +107,14 @@ def options(doc: str, **defaults: Any) -> argparse.Namespace:
 
 
 def only(cases: Iterable[Case], args: argparse.Namespace) -> list[Case]:
-    """The case of the name asked for, or all that have it in their names."""
+    """The case of the name asked for, or all that have it in their names; exits if none has."""
     cases = list(cases)
     exact = [case for case in cases if case.label == args.only]
-    return exact or [case for case in cases if args.only in case.label]
+    chosen = exact or [case for case in cases if args.only in case.label]
+    if not chosen:
+        print(f"only: no case has '{args.only}' in its name; --list names them.", file=sys.stderr)
+        raise SystemExit(2)
+    return chosen
 
 
 def schedule(args: argparse.Namespace, **changes: Any) -> Schedule:
