@@ -1,26 +1,51 @@
-"""Coverage-guided fuzzing of all that reads what others made.
+"""Fuzzing of all that reads what others made: coverage-guided by atheris if that is installed.
 
     pip install atheris
     python reliability/fuzz.py [--minutes 10] [--seed 0]
 
 Fed are JSON files, stored directories (manifest and payload as raw bytes, and sound ones with odd
 values in a manifest that is sealed again), run.json, and certificates up to `recheck`. Each has to
-be read, or refused by a UserError of one line; anything else, a hang of a minute, or 4 GB of memory
-ends the search with the input that did it.
+be read, or refused by a UserError of one line; anything else (for atheris a hang of a minute, or
+4 GB of memory, too) ends the search.
 """
 
 import argparse
 import copy
 import json
 import random
+import shutil
 import sys
 import tempfile
+import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 
 ROOT = Path(__file__).parent.parent
 ODD = [None, True, False, -1, 0, 1, 2**31, -1e308, 1e308, 0.5, "", "x", "../x", [], {}, [[]], [{}]]
+
+
+class Dice:
+    """What atheris makes of its bytes, from plain random numbers."""
+
+    def __init__(self, seed: int):
+        self.random = random.Random(seed)
+
+    def ConsumeIntInRange(self, low: int, high: int) -> int:
+        return self.random.randint(low, high)
+
+    def ConsumeInt(self, size: int) -> int:
+        return self.random.getrandbits(8 * size) - 2 ** (8 * size - 1)
+
+    def ConsumeRegularFloat(self) -> float:
+        return self.random.uniform(-1, 1) * 10.0 ** self.random.randint(-300, 300)
+
+    def ConsumeUnicodeNoSurrogates(self, count: int) -> str:
+        return "".join(chr(self.random.randrange(0xD800)) for _ in range(count))
+
+    def ConsumeBytes(self, count: int) -> bytes:
+        return self.random.randbytes(self.random.randint(0, count))
 
 
 def edited(data: Any, value: Any) -> Any:
@@ -127,23 +152,24 @@ def loaders(place: Path) -> list[Any]:
     return [plain, lines, raw, sealed, verdicts, config]
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=0)
-    args = parser.parse_args()
-    import atheris
-
+    args = parser.parse_args(argv)
     sys.path.insert(0, str(ROOT))
-    with atheris.instrument_imports(include=["marlyap"]):
+    try:
+        import atheris
+    except ImportError:
+        atheris = None
+    with atheris.instrument_imports(include=["marlyap"]) if atheris else nullcontext():
         from marlyap.errors import UserError
 
         place = Path(tempfile.mkdtemp())
         kinds = loaders(place)
     seen = {kind.__name__: [0, 0] for kind in kinds}  # fed, refused
 
-    def one(raw: bytes) -> None:
-        data = atheris.FuzzedDataProvider(raw)
+    def one(data: Any) -> None:
         kind = kinds[data.ConsumeIntInRange(0, len(kinds) - 1)]
         seen[kind.__name__][0] += 1
         try:
@@ -154,12 +180,20 @@ def main() -> None:
         if sum(fed for fed, _ in seen.values()) % 500 == 0:
             print(json.dumps(seen), flush=True)
 
+    if atheris is None:
+        end, dice = time.monotonic() + 60 * args.minutes, Dice(args.seed)
+        while time.monotonic() < end:
+            one(dice)
+        print("fed and refused:", json.dumps(seen))
+        shutil.rmtree(place)
+        return
     search = [f"-max_total_time={60 * args.minutes:.0f}", f"-seed={args.seed + 1}"]
     limits = ["-timeout=60", "-rss_limit_mb=4096", "-max_len=4096", "-len_control=0"]
     (place / "corpus").mkdir()
     for number in range(100):
         (place / "corpus" / str(number)).write_bytes(random.Random(number).randbytes(200))
-    atheris.Setup([sys.argv[0], *search, *limits, str(place / "corpus")], one)
+    target = lambda raw: one(atheris.FuzzedDataProvider(raw))
+    atheris.Setup([sys.argv[0], *search, *limits, str(place / "corpus")], target)
     atheris.Fuzz()
 
 

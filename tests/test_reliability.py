@@ -1,6 +1,8 @@
-"""The scripts that take guards away and make mutants still fit the source they change."""
+"""The scripts that remove guards, make mutants and feed loaders fit what they are for."""
 
 import ast
+import importlib
+import json
 import re
 from pathlib import Path
 
@@ -70,3 +72,11 @@ def test_a_sandbox_is_a_copy_that_is_put_back(scripts):
             assert (place / name).read_text() == "x = 1\n"
         assert (place / name).read_text() == before == (ROOT / name).read_text()
         assert (place / "tests" / "conftest.py").is_file()
+
+
+@pytest.mark.slow
+def test_the_fuzzer_feeds_every_loader(scripts, capsys):
+    importlib.import_module("fuzz").main(["--minutes", "0.1"])
+    said = capsys.readouterr().out.splitlines()[-1]
+    seen = json.loads(said.removeprefix("fed and refused: "))
+    assert len(seen) == 6 and all(fed > 0 for fed, _ in seen.values())
