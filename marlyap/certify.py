@@ -87,8 +87,7 @@ def save(
 ) -> None:
     """Store a result of `certify` with all that an independent checker needs.
 
-    That is the arrays of the controller and of V, and the graph; what was drawn at random follows
-    from the seed.
+    That is the arrays of the controller and of V; what was drawn at random follows from the seed.
     """
     if policy_hash(controller) != result["policy"]:
         raise UserError("policy: this controller is not the one that was certified.")
@@ -96,6 +95,5 @@ def save(
     arrays = {f"controller/{k}": v for k, v in named_arrays(controller).items()}
     arrays["controller/words"] = words(controller)
     arrays |= {f"V/{k}": v for k, v in named_arrays(V).items()}
-    arrays |= {"graph/slots": game.slots, "graph/linked": game.adjacency, "graph/leads": game.leads}
     arrays = {k: np.asarray(v) for k, v in arrays.items()}
     store.write(Path(directory), KIND, arrays, plain(dict(result)), replace=replace)

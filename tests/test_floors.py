@@ -20,9 +20,11 @@ FLOORS = """
     statistics
     store
     identity
+    graph
+    threefry
+    replica
     recheck
     dynamics
-    graph
     sensing
     game
     tasks
