@@ -17,7 +17,7 @@ from scipy import stats
 
 from marlyap.algorithms import MASAC
 from marlyap.constraint import Unconstrained
-from marlyap.constraints.lyapunov import Certificate, Lyapunov
+from marlyap.constraints.lyapunov import Certificate, Lyapunov, distance
 from marlyap.errors import UserError
 from marlyap.learn import Learnt, polyak
 from marlyap.nets import MLP, Actors, Critic, Greedy, LyapunovNet, NormNet, Sampled, Shape
@@ -800,6 +800,22 @@ def test_discounted_sums_fall_where_they_are_bounded_by_the_cost(seen, batch, dr
         np.testing.assert_allclose(rise, -margin * (1 - g) / g, atol=5e-5)
         both += list(np.sign(margin))
     assert {-1, 1} == set(both)
+
+
+def test_distance_is_zero_with_a_gradient_of_zero_where_actions_agree():
+    a, b = jnp.full((3, 2), 0.4), jnp.full((3, 2), 0.4).at[0, 0].add(0.3)
+    value, gradient = jax.value_and_grad(distance)(a, a)
+    assert value == 0 and np.all(gradient == 0)
+    value, gradient = jax.value_and_grad(distance)(b, a)
+    assert float(value) == pytest.approx(0.3, rel=1e-5)
+    assert np.allclose(gradient, np.zeros((3, 2)) + (np.arange(6).reshape(3, 2) == 0), atol=1e-5)
+
+
+@pytest.mark.parametrize("slope", ["empirical", 0.0])
+def test_the_slope_is_followed_only_where_it_is_asked_for(slope, masac, learner, batch, drawn):
+    constraint = replace(masac.constraint, slope=slope)
+    L, _ = eqx.filter_jit(constraint.update)(learner.L, batch, *drawn, jnp.ones(()))
+    assert (float(L.gradient) != float(learner.L.gradient)) == (slope == "empirical")
 
 
 def test_what_does_not_fit_together_is_refused():
