@@ -201,8 +201,8 @@ def _measure(game: AbstractGame, controller: Any, keys: Any) -> tuple[Any, Any]:
     def one(key):
         k_start, k_act = jax.random.split(key)
         long = rollout(game, controller, game.reset(k_start), k_act, game.horizon + 1)
-        least = Contraction(T=min(T, game.horizon)).judge(game, None, long).figures["beta"]
-        return outcome(game, until(long, game.horizon)).final, least
+        found = Contraction(T=min(T, game.horizon)).judge(game, None, long, k_act)
+        return outcome(game, until(long, game.horizon)).final, found.figures["beta"]
 
     return jax.vmap(one)(keys)
 
