@@ -92,7 +92,8 @@ def parser() -> Parser:
     p.add_argument("--task", default=None, help="the task, for controllers or tasks of your own")
     p.add_argument("--algorithm", default=None, help="the algorithm, where it is your own code")
     p.add_argument("--certificates", nargs="+", default=None, help="names (default: the sampled)")
-    p.add_argument("--rollouts", type=int, default=10_000, help="fresh starts (default 10000)")
+    each = "fresh starts of each (default 10000; robustness 2000, theorem1 and composition 5000)"
+    p.add_argument("--rollouts", type=int, default=None, help=each)
     p.add_argument("--confidence", type=float, default=0.999, help="of all claims together")
     p.add_argument("--seed", type=int, default=0, help="of the starts (default 0)")
     p.add_argument("--out", type=Path, default=None, help="directory (default RUN/certificate)")

@@ -261,7 +261,7 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
             hint = config.suggest(name, CERTIFICATES)
             raise UserError(f"certificates: there is none called '{name}'; {hint}")
         c = CERTIFICATES[name]
-        several = "rollouts" in config.fields(c)
+        several = args.rollouts is not None and "rollouts" in config.fields(c)
         chosen[name] = dataclasses.replace(c, rollouts=args.rollouts) if several else c  # pyright: ignore
     # Learnt policies keep moving a little on the target: what counts is leaving the ball.
     V = CostSum(controller=controller, ball=game.radius)
