@@ -46,6 +46,18 @@ def quick_compilation():
     jax.config.update("jax_disable_most_optimizations", False)
 
 
+def put_anywhere(data, value, tree):
+    """Write `value` over one place in nested JSON, which Hypothesis's `data` draws."""
+    from hypothesis import strategies as st
+
+    while True:
+        key = data.draw(st.sampled_from([*tree] if isinstance(tree, dict) else range(len(tree))))
+        if not (isinstance(tree[key], dict | list) and tree[key] and data.draw(st.booleans())):
+            tree[key] = value
+            return
+        tree = tree[key]
+
+
 def filled(make, *args, seed=0):
     """What `make(*args)` returns, every float random: nothing is equal by birth or compiled."""
     import equinox as eqx

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import safetensors.numpy
+from conftest import put_anywhere
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from marlyap import store
@@ -519,13 +520,7 @@ def test_any_value_anywhere_in_a_sealed_manifest(tmp_path, data, value):
         (tmp_path / "sound").write_bytes((tmp_path / "a" / MANIFEST).read_bytes())
     manifest = json.loads((tmp_path / "sound").read_bytes())
     del manifest["sha256"]
-    node = manifest
-    while True:
-        key = data.draw(st.sampled_from([*node] if isinstance(node, dict) else range(len(node))))
-        if not (isinstance(node[key], dict | list) and node[key] and data.draw(st.booleans())):
-            break
-        node = node[key]
-    node[key] = value
+    put_anywhere(data, value, manifest)
     (tmp_path / "a" / MANIFEST).write_bytes(store._sealed(manifest))
     try:
         arrays, _ = store.read(tmp_path / "a", "policy")
