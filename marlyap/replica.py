@@ -69,10 +69,12 @@ class Replica:
         return self.cache[name]
 
     def bounded(self, n: int, steps: int) -> None:
+        """Raise Rejected if so many rollouts would fill the memory."""
         if not 0 <= max(n, 1) * max(steps, 1) * len(self.slots) <= MOST:
             raise Rejected(f"certificate: {n} rollouts of {steps} steps are too many to check.")
 
     def drive(self, x: Any, goal: Any, key: Any, steps: int, change: Any) -> dict[str, Any]:
+        """As `roll`, from states [episode, agent, .] and goals [episode, agent, 2] (m, rad, s)."""
         x[..., :2] *= change.get("spread", 1.0)
         noise, drop = change.get("noise", 0.0), np.float32(change.get("drop", 0.0))
         self.bounded(len(x), steps + change.get("delay", 0))
