@@ -42,10 +42,8 @@ def main(argv=None):
                 "agents": n,
                 "updates/s": 1 / time.median,
                 "by cpu": 1 / time.cpu,
-                "xla MFLOP": case.xla / 1e6,
                 "scratch MB": case.memory / 2**20,
                 "growth": times[critic, name, n].cpu / least / (n / few),
-                "growth of work": case.xla / cases[critic, name, few].xla / (n / few),
             }
         )
     return harness.report("agents", rows, args)

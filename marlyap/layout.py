@@ -77,7 +77,11 @@ def matmul(W: Float[Array, "*stack out in"], x: Array) -> Array:
 def _backward(residual: tuple[Array, Array], g: Array) -> tuple[Array, Array]:
     W, x = residual
     if W.ndim == x.ndim:
-        return g @ jnp.swapaxes(x, -1, -2), jnp.swapaxes(W, -1, -2) @ g
+        gradient_W = g @ jnp.swapaxes(x, -1, -2)
+        if W.shape[-2] == 1:
+            # One output: XLA would multiply without a product, and compute g for each input anew.
+            W, g = (jnp.concatenate([a, jnp.zeros_like(a)], axis=-2) for a in (W, g))
+        return gradient_W, jnp.swapaxes(W, -1, -2) @ g
     tall_W, tall_g = (a.reshape(*a.shape[:-3], -1, a.shape[-1]) for a in (W, g))
     gradient_W = (tall_g @ jnp.swapaxes(x, -1, -2)).reshape(W.shape)
     return gradient_W, jnp.swapaxes(tall_W, -1, -2) @ tall_g

@@ -10,6 +10,7 @@ import pytest
 from conftest import close, filled
 from test_paper import mlp, rows, xs
 
+from marlyap import learn
 from marlyap.algorithms.masac import MASAC
 from marlyap.constraints.lyapunov import Lyapunov
 from marlyap.errors import UserError
@@ -70,6 +71,30 @@ def test_the_same_weights_serve_any_number_of_agents(shape):
         np.testing.assert_allclose(mode(pi, o), want, rtol=1e-4, atol=1e-5)
 
 
+def test_a_batch_in_parts_descends_as_the_whole(monkeypatch):
+    """Large teams take a batch in parts, so that what it passes through stays in the cache."""
+    assert [learn.parts(256, n) for n in (3, 8, 16, 32, 128, 1000)] == [1, 1, 8, 16, 64, 256]
+    assert learn.parts(7, 1000) == 7 and learn.parts(250, 10) == 5
+    game = Rendezvous(agents=3, horizon=4)
+    algorithm = MASAC(**TINY, shared=True, critic="mean-field", constraint=Lyapunov(horizon=2))
+    trainer = Trainer(game, algorithm, Schedule(steps=16, environments=2, warmup=8))
+    monkeypatch.setattr(learn, "PART", 6)  # two transitions of three agents
+
+    def updated(whole):
+        monkeypatch.setattr(learn, "WHOLE", whole)
+        assert learn.parts(algorithm.batch, game.agents) == (1 if whole > 1 else 4)
+
+        @eqx.filter_jit
+        def update(key):
+            carry = trainer.begin(key)
+            batch = carry.memory.sample(key, algorithm.batch, algorithm.gamma)
+            return algorithm.update(carry.learner, batch, jnp.ones(()))
+
+        return update(KEY)
+
+    close(updated(1), updated(10**6), rtol=1e-3, atol=1e-5)
+
+
 def work(agents):
     """Floating-point operations of one update, as XLA counts them before it compiles."""
     game = Rendezvous(agents=agents, graph="path")
@@ -91,7 +116,8 @@ def work(agents):
     return jax.jit(one).lower(dynamic, batch).cost_analysis()["flops"]
 
 
-def test_work_grows_no_faster_than_the_number_of_agents():
+def test_work_grows_no_faster_than_the_number_of_agents(monkeypatch):
+    monkeypatch.setattr(learn, "WHOLE", 10**6)  # a loop's body counts once
     few, many = work(8), work(32)
     assert 2 < many / few < 1.05 * 32 / 8
 

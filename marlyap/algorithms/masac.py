@@ -29,7 +29,7 @@ from jaxtyping import PyTree
 from marlyap.algorithm import AbstractOffPolicy
 from marlyap.constraint import AbstractConstraint, Unconstrained
 from marlyap.errors import within
-from marlyap.learn import Learnt, polyak
+from marlyap.learn import Learnt, in_parts, parts, polyak
 from marlyap.nets import Actors, Critic, Greedy, MeanFieldCritic, Sample, Sampled
 from marlyap.rollout import AbstractExplorer, Policy
 from marlyap.types import Scalar, Transition
@@ -124,22 +124,23 @@ class MASAC(AbstractOffPolicy):
     def update(self, learner, b, decay):
         """The assignments of Algorithm 2 in its order; without a constraint, of Algorithm 1."""
         l = learner
+        n = parts(*b.obs.shape[:2])
 
         # a ~ pi_phi(. | s_t) and a_{t+1} ~ pi_phi(. | s_{t+1}): the same for every objective
         draw = lambda pi, b: (
             pi.sample(b.obs, b.noise[:, 0], b.action),
             pi.sample(b.next_obs, b.noise[:, 1], b.action),
         )
-        now, nxt = jax.vmap(lambda b: draw(l.pi.value, b))(b)
+        now, nxt = in_parts(lambda b: draw(l.pi.value, b), b, n)
 
         # theta <- theta - iota_Q grad J_Q
         J_Q = lambda Q, b, nxt: self.J_Q(Q, l, b, nxt)
-        Q, loss_Q = l.Q.descend(J_Q, b, nxt, rate=decay * self.rate_Q)
+        Q, loss_Q = l.Q.descend(J_Q, b, nxt, rate=decay * self.rate_Q, parts=n)
         l = eqx.tree_at(lambda l: l.Q, l, Q)
 
         # phi <- phi - iota_pi grad J_pi, eq. (11); XLA merges this drawing with the one above
         J_pi = lambda pi, b: self.J_pi(*draw(pi, b), l, b)
-        pi, loss_pi = l.pi.descend(J_pi, b, rate=decay * self.rate_pi)
+        pi, loss_pi = l.pi.descend(J_pi, b, rate=decay * self.rate_pi, parts=n)
 
         # alpha <- alpha - iota_alpha grad J_alpha
         log_alpha, _ = l.log_alpha.descend(self.J_alpha, now, rate=decay * self.rate_alpha)
