@@ -106,6 +106,7 @@ def curves(args):
             ends = [[e.low for e in points.values()], [e.high for e in points.values()]]
             axes.vlines(x, *ends, color=line.get_color(), alpha=0.5)
         axes.set(ylim=(-0.03, 1.03), title=MEANING[kind])
+        axes.set_xticks(x)
     panels[0].set_ylabel(f"success within {RADIUS} m", fontsize=8)
     panels[0].legend(frameon=False, fontsize=7)
     save(figure, args.results / f"robustness-{args.task}.png")
