@@ -173,8 +173,12 @@ class Run:
             raise UserError(f"run: {self.directory} has no policy yet; train it first.")
         arrays, _ = store.read(place, "policy")
         a = self.trainer.algorithm
-        learner = eqx.filter_eval_shape(a.init, shape(self.game), jax.random.key(0))
-        like = (a.exploit(learner), a.lyapunov(learner))
+
+        def made(key):
+            learner = a.init(shape(self.game), key)
+            return a.exploit(learner), a.lyapunov(learner)
+
+        like = eqx.filter_eval_shape(made, jax.random.key(0))
         return unflatten(like, arrays, str(place))
 
     def controller(self, game: AbstractGame | None = None) -> Decentralised:

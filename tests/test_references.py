@@ -10,12 +10,16 @@ import pytest
 from conftest import filled, same
 from scipy import stats
 
+from marlyap import store
 from marlyap.algorithms import ALGORITHMS, MADDPG, MASAC, PRESETS, CentralisedSAC, DecentralisedSAC
 from marlyap.algorithms.sac import alone, joint
 from marlyap.constraints import Lyapunov
 from marlyap.errors import UserError
 from marlyap.learn import Learnt
 from marlyap.nets import Actors, Noisy, Sample
+from marlyap.run import Run, flatten
+from marlyap.tasks.rendezvous import Rendezvous
+from marlyap.trainer import Schedule, Trainer, shape as nets_shape
 
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -27,6 +31,25 @@ step = eqx.filter_jit(lambda rule, l, b: rule.update(l, b, ONE)[0])
 
 def at(tree, i):
     return jax.tree.map(lambda x: x[i] if eqx.is_array(x) else x, tree)
+
+
+HANDED = {"masac-lyapunov", "decentralised-sac", "centralised-sac", "apg"}  # each kind of policy
+LIKE_THEM = (pytest.param(name, marks=pytest.mark.slow) for name in sorted({*ALGORITHMS} - HANDED))
+
+
+@pytest.mark.parametrize("name", [*sorted(HANDED), *LIKE_THEM])
+def test_what_is_handed_out_is_read_back(name, tmp_path):
+    """The policy of a run is rebuilt from shapes alone before its arrays are read."""
+    algorithm = ALGORITHMS[name]
+    small = {k: 4 for k in ("actor_width", "critic_width") if hasattr(algorithm, k)}
+    algorithm, game = dataclasses.replace(algorithm, **small), Rendezvous(horizon=40)
+    run = Run.create(tmp_path / "run", Trainer(game, algorithm, Schedule()), 0, {})
+    learner = eqx.filter_jit(algorithm.init)(nets_shape(game), KEY)
+    handed = (algorithm.exploit(learner), algorithm.lyapunov(learner))
+    store.write(run.directory / "policy", "policy", flatten(handed), {})
+    assert eqx.tree_equal(run.handed_out(), handed)
+    action = run.controller().policy(jnp.zeros((3, nets_shape(game).obs)), KEY)
+    assert action.shape == (3, 2)
 
 
 def test_alone_an_agent_has_its_own_row_and_observes_the_state(batch):
