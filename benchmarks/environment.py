@@ -42,7 +42,7 @@ class Seeing(eqx.Module):
 
 def main(argv=None):
     args = harness.arguments(
-        argv, __doc__, agents=[3, 5, 32], environments=[1, 64, 1024, 8192], rounds=20
+        argv, __doc__, agents=[3, 5, 32], environments=[1, 64, 1024, 8192], rounds=4
     )
     if args.quick:
         args.agents, args.environments, args.rounds = [2], [1, 2], 2
