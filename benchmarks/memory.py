@@ -33,7 +33,7 @@ def child(args):
 
 
 def main(argv=None):
-    args = harness.arguments(argv, __doc__, agents=[3, 5, 16, 64], child=0)
+    args = harness.arguments(argv, __doc__, agents=[3, 5, 16], child=0)
     if args.quick:
         args.agents = args.agents[:1]
     if args.child:
