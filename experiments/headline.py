@@ -1,7 +1,7 @@
 """MASAC with and without the Lyapunov term, many seeds: learning curves, success over 500 starts.
 
-Two more cases: the condition made five times as strict, so that its learnt weight stays at 1 and
-does not fade; and the control, the same network of the next T costs, with the policy asked to make
+Two more cases: the condition made five times as strict, so that its learnt weight fades more
+slowly; and the control, the same network of the next T costs, with the policy asked to make
 it small and not to make it fall.
 
     ./run python experiments/headline.py            ten seeds of each

@@ -124,7 +124,7 @@ class MASAC(AbstractOffPolicy):
     def update(self, learner, b, decay):
         """The assignments of Algorithm 2 in its order; without a constraint, of Algorithm 1."""
         l = learner
-        n = parts(*b.obs.shape[:2])
+        n = parts(*b.obs.shape[:2])  # of the batch, one after the other: 1 for small teams
 
         # a ~ pi_phi(. | s_t) and a_{t+1} ~ pi_phi(. | s_{t+1}): the same for every objective
         draw = lambda pi, b: (
