@@ -4,6 +4,7 @@ Nothing of marlyap may be imported at the top of this file: pytest loads it befo
 to check the package, and what is imported by then stays unchecked (test_floors.py notices).
 """
 
+import gc
 import os
 from pathlib import Path
 
@@ -14,6 +15,8 @@ import pytest
 
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+MAPS = 25_000  # in use when a module ends; one module adds up to 10,000
 
 
 def keep_compiled_code():
@@ -36,6 +39,19 @@ keep_compiled_code()
 def single_precision():
     """The package runs in float32; a test that needs more says `with jax.enable_x64(True)`."""
     assert not jax.config.jax_enable_x64
+
+
+@pytest.fixture(autouse=True, scope="module")
+def room_for_programs():
+    """Forget compiled programs in time: each takes ten memory maps, and Linux allows 65,530.
+
+    XLA does not survive the failure of the next one; a whole suite in two processes comes that far.
+    """
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_bytes().splitlines()) > MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="module")
