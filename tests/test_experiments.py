@@ -16,6 +16,7 @@ PLACE = Path(__file__).parent.parent / "experiments"
 SCRIPTS = {
     "headline": ["algorithm"],
     "references": ["algorithm", "budget"],
+    "forms": ["form", "budget"],
     "readings": ["reading", "Q", "horizon", "decrease", "weight", "budget"],
     "ingredients": ["ingredient", "budget"],
     "sizes": ["algorithm", "agents", "graph", "leaders", "budget"],
