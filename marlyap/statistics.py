@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import special
+import scipy  # its parts are loaded when they are first used
 
 from marlyap.errors import UserError
 
@@ -105,12 +105,12 @@ def _scalar(array: Any) -> Any:
 
 
 def _lower(k: np.ndarray, n: np.ndarray, tail: float) -> Reals:
-    inner = special.betaincinv(np.maximum(k, 1.0), n - k + 1.0, tail)
+    inner = scipy.special.betaincinv(np.maximum(k, 1.0), n - k + 1.0, tail)
     return _scalar(np.where(k == 0, 0.0, inner))
 
 
 def _upper(k: np.ndarray, n: np.ndarray, tail: float) -> Reals:
-    inner = special.betainccinv(k + 1.0, np.maximum(n - k, 1.0), tail)
+    inner = scipy.special.betainccinv(k + 1.0, np.maximum(n - k, 1.0), tail)
     return _scalar(np.where(k == n, 1.0, inner))
 
 
@@ -182,7 +182,7 @@ def wilson(successes: Counts, trials: Counts, confidence: Any = 0.95) -> Interva
     1927; recommended by Agresti and Coull, The American Statistician 52, 1998.
     """
     k, n = _counts(successes, trials)
-    z = -special.ndtri((1.0 - _fraction("confidence", confidence)) / 2.0)
+    z = -scipy.special.ndtri((1.0 - _fraction("confidence", confidence)) / 2.0)
     centre = (k + z**2 / 2.0) / (n + z**2)
     half = z * np.sqrt(k * (n - k) / n + z**2 / 4.0) / (n + z**2)
     high = np.where(k == n, 1.0, centre + half)  # Free of rounding, as the low end is at k = 0.
@@ -209,7 +209,7 @@ def mcnemar(a: Any, b: Any) -> PairedTest:
             f"a and b must be vectors of one length of at least 1, not {a.shape} and {b.shape}."
         )
     only_a, only_b = int(np.sum(a & ~b)), int(np.sum(b & ~a))
-    tail = special.bdtr(min(only_a, only_b), only_a + only_b, 0.5)
+    tail = scipy.special.bdtr(min(only_a, only_b), only_a + only_b, 0.5)
     return PairedTest(only_a, only_b, min(1.0, 2.0 * float(tail)))
 
 
@@ -332,7 +332,7 @@ def quantile_upper_bound(sample: Any, q: Any, confidence: Any) -> float:
     """
     ordered = np.sort(_numbers("sample", sample, 1, 1, finite=False))
     q, confidence = _fraction("q", q), _fraction("confidence", confidence)
-    covered = special.bdtr(np.arange(ordered.size, dtype=float), ordered.size, q)
+    covered = scipy.special.bdtr(np.arange(ordered.size, dtype=float), ordered.size, q)
     index = int(np.searchsorted(covered, confidence, side="left"))
     return float(ordered[index]) if index < ordered.size else math.inf
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import linprog
+import scipy  # its parts are loaded when they are first used
 
 from marlyap import graph as graphs
 from marlyap.certificate import (
@@ -131,7 +131,7 @@ def fit_row(
     solution = np.zeros(len(who) + 1)
     for _ in range(rounds):
         left = -np.column_stack([now[pick], np.ones(len(pick))])
-        solved = linprog(cost, left, -ahead[pick], bounds=bounds, method="highs")
+        solved = scipy.optimize.linprog(cost, left, -ahead[pick], bounds=bounds, method="highs")
         solution = solved.x
         excess = ahead - now @ solution[:-1] - solution[-1]
         if np.max(excess) <= 1e-7:
