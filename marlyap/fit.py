@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from marlyap import store
+from marlyap import devices, store
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.diagnose import diagnose
 from marlyap.errors import UserError
@@ -136,13 +136,15 @@ def advance(
     The arrays of `carry` have a leading axis of runs where there are several; those of the log
     always have it. The carry that goes in is used up.
     """
-    done = int(np.min(carry.iteration))
+    done, mesh = int(np.min(carry.iteration)), devices.mesh_for(carry.iteration.size)
+    carry = devices.placed(carry, carry.iteration.ndim > 0, mesh)
     while done < trainer.iterations and not stop():
-        carry, info = _iterate(trainer, carry)
         done += 1
-        if done % trainer.schedule.judge_every == 0 or done == trainer.iterations:
-            carry, look = _judge(trainer, carry)
-            info |= look
+        with devices.using(mesh):
+            carry, info = _iterate(trainer, carry)
+            if done % trainer.schedule.judge_every == 0 or done == trainer.iterations:
+                carry, look = _judge(trainer, carry)
+                info |= look
         yield done, carry, jax.tree.map(np.atleast_1d, info)
 
 
@@ -219,9 +221,15 @@ def _row(carry: Carry, i: int) -> Carry:
     return jax.tree.map(lambda x: x[i] if eqx.is_array(x) else x, carry)
 
 
-def _each(f: Callable[[Carry], Any], carry: Carry) -> Any:
+def _each(
+    f: Callable[[Carry], tuple[Carry, dict[str, Any]]], carry: Carry
+) -> tuple[Carry, dict[str, Any]]:
     """`f` for every run: vmapped only when there are several, since a batch of one costs speed."""
-    return f(carry) if carry.iteration.ndim == 0 else eqx.filter_vmap(f)(carry)
+    several = carry.iteration.ndim > 0
+    axis: dict[str, Any] = {"spmd_axis_name": devices.RUNS}
+    each = eqx.filter_vmap(f, **axis) if several else f
+    after, info = each(carry)
+    return devices.kept(after, several), info
 
 
 @eqx.filter_jit(donate="all-except-first")

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
 from marlyap.algorithm import AbstractAlgorithm, AbstractModelBased, AbstractOffPolicy
+from marlyap.devices import spread
 from marlyap.errors import within
 from marlyap.evaluation import outcomes
 from marlyap.game import AbstractGame
@@ -124,7 +125,7 @@ class Trainer(eqx.Module):
         key, k_play, k_learn = jax.random.split(carry.key, 3)
         decay, memory, a = self.decay(carry.iteration), carry.memory, self.algorithm
         if isinstance(a, AbstractModelBased):
-            keys = jax.random.split(k_play, self.schedule.environments)
+            keys = spread(jax.random.split(k_play, self.schedule.environments))
             learner, info = a.improve(carry.learner, self.game, keys, decay)
             seen = jax.tree.map(lambda x: x[None], watch(learner))
         else:
@@ -177,7 +178,7 @@ class Trainer(eqx.Module):
         Its score is the success rate, plus a tenth of that at half the radius to break ties.
         """
         policy = self.algorithm.exploit(carry.learner)
-        keys = jax.random.split(stream(0, "select"), self.schedule.judge_episodes)
+        keys = spread(jax.random.split(stream(0, "select"), self.schedule.judge_episodes))
         final = outcomes(self.game, Decentralised(policy, self.game), keys).final
         within = lambda r: jnp.mean((final <= r).astype(float))
         score = within(self.game.radius) + 0.1 * within(self.game.radius / 2)
@@ -213,7 +214,7 @@ class Trainer(eqx.Module):
                 terminated=long.terminated[: game.horizon],
             )
 
-        return jax.vmap(one)(jax.random.split(key, episodes))
+        return jax.vmap(one)(spread(jax.random.split(key, episodes)))
 
     def decay(self, iteration: Int[Array, ""]) -> Scalar:
         """What the learning rates are multiplied by."""

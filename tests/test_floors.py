@@ -16,6 +16,7 @@ import marlyap
 FLOORS = """
     errors
     types
+    devices
     seeds
     statistics
     store
