@@ -13,7 +13,12 @@ from marlyap import MASAC, Lyapunov, Rendezvous
 
 def main(argv=None):
     args = harness.arguments(
-        argv, __doc__, agents=[3, 8, 32, 128], critics=["mean-field", "joint"], rounds=10, count=5
+        argv,
+        __doc__,
+        agents=[3, 8, 32, 128, 256],
+        critics=["mean-field", "joint"],
+        rounds=10,
+        count=5,
     )
     smaller = {}
     if args.quick:

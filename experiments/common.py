@@ -153,10 +153,10 @@ def fill(name: str, cases: Sequence[Case], args: argparse.Namespace) -> None:
     key = lambda case, seed: tuple(str(v) for v in (*case.about.values(), seed))
     wanted = [(c, s) for c in cases for s in args.seeds if key(c, s) not in there]
     runs = {key(c, s): c.run(root, s) for c, s in wanted}
-    lost = train(list(runs.values()), args)
+    train(list(runs.values()), args)
     for case, seed in wanted:
         run = runs[key(case, seed)]
-        if run.directory in lost:
+        if not run.finished:  # given up
             continue
         about = case.about | {"seed": seed}
         final, contracts = measure(run.game, run.controller(), args.episodes)
@@ -173,27 +173,25 @@ def fill(name: str, cases: Sequence[Case], args: argparse.Namespace) -> None:
             shutil.rmtree(run.directory / "checkpoints", ignore_errors=True)
 
 
-def train(runs: list[Run], args: argparse.Namespace) -> set[Path]:
-    """Train to the end; returns where a number stopped being finite."""
-    waiting, lost = [run for run in runs if not run.finished], set()
+def train(runs: list[Run], args: argparse.Namespace) -> None:
+    """Train to the end, or until a number stops being finite: those are given up."""
+    waiting = [run for run in runs if not run.finished]
     while waiting:
         try:
             if args.quick:
                 for run in waiting:
                     list(fit([run]))
-                return lost
+                return
             parallel = argparse.Namespace(parallel="auto", worker=False, task="", algorithm="")
             if code := train_all(waiting, parallel):
                 raise SystemExit(code)
-            return lost
+            return
         except UserError as error:
             gone = {run.directory for run in waiting if str(run.directory) in str(error)}
             if not gone:
                 raise
             print(f"given up: {error}")
-            lost |= gone
-            waiting = [run for run in waiting if run.directory not in gone]
-    return lost
+            waiting = [r for r in waiting if r.directory not in gone and not r.finished]
 
 
 @eqx.filter_jit
@@ -314,6 +312,16 @@ def forest(args: argparse.Namespace, name: str) -> None:
         axes.set_yticks([-k for k in range(len(order))])
         axes.set_yticklabels(order if axes is panels[0] else [], fontsize=7)
     save(figure, args.results / f"{name}.png")
+
+
+def improvements(args: argparse.Namespace, name: str, plain: str) -> None:
+    """On standard output: how probably each case is above the plain one, measure by measure."""
+    for measure, cases in estimates(args, name).items():
+        for case, e in cases.items():
+            if case == plain or plain not in cases:
+                continue
+            p, (low, high) = statistics.probability_of_improvement(e.seeds, cases[plain].seeds)
+            print(f"P({case} above {plain}) = {p:.2f} [{low:.2f}, {high:.2f}], {measure}")
 
 
 def canvas(panels: int, width: float, height: float) -> tuple[Any, list[Any]]:

@@ -10,7 +10,7 @@ learnt from its own slow copy and not from whole rollouts; or L must fall by hal
 
 from dataclasses import replace
 
-from common import Case, experiment, options, schedule
+from common import Case, experiment, forest, improvements, options, schedule
 
 from marlyap.algorithms import MASAC
 from marlyap.constraints import Lyapunov
@@ -37,6 +37,12 @@ def cases(args):
         yield Case(about, TASKS[args.task], MASAC(constraint=L), schedule(args))
 
 
+def compared(args, name):
+    """The figure, and who is better than plain MASAC."""
+    forest(args, name)
+    improvements(args, name, "none")
+
+
 if __name__ == "__main__":
     args = options(__doc__)
-    experiment("forms", list(cases(args)), args)
+    experiment("forms", list(cases(args)), args, compared)

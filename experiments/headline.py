@@ -15,10 +15,9 @@ Runs are kept in --runs and gone on with when the script is started again.
 
 from collections import defaultdict
 
-import numpy as np
-from common import RADIUS, Case, experiment, forest, options, read, schedule
+from common import Case, experiment, forest, improvements, options, read, schedule
 
-from marlyap import draw, statistics
+from marlyap import draw
 from marlyap.algorithms import ALGORITHMS, MASAC
 from marlyap.constraints import Lyapunov
 from marlyap.tasks import TASKS
@@ -55,15 +54,7 @@ def curves(args, name):
         for (algorithm, seed), rows in points.items()
     ]
     draw.learning_curves_png(runs, args.results / f"{name}-curves.png")
-    rates = defaultdict(list)
-    for row in read(args, f"{name}-success"):
-        if float(row["radius"]) == RADIUS:
-            rates[row["algorithm"]].append(float(row["success_rate"]))
-    if not all(rates[algorithm] for algorithm in COMPARED):
-        return
-    a, b = (np.array(rates[algorithm]) for algorithm in COMPARED)
-    p, (low, high) = statistics.probability_of_improvement(b, a)
-    print(f"P({COMPARED[1]} succeeds more often) = {p:.2f} [{low:.2f}, {high:.2f}]")
+    improvements(args, name, COMPARED[0])
 
 
 if __name__ == "__main__":

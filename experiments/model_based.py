@@ -10,7 +10,16 @@ The learnt part sees what MASAC sees; only the trainer differentiates the equati
 
 from dataclasses import replace
 
-from common import RADIUS, Case, counted, experiment, options, read
+from common import (
+    RADIUS,
+    Case,
+    counted,
+    experiment,
+    forest,
+    improvements,
+    options,
+    read,
+)
 
 from marlyap.algorithms import ALGORITHMS
 from marlyap.controllers import CONTROLLERS
@@ -31,9 +40,15 @@ def cases(args):
         yield Case(about, TASKS[args.task], algorithm, plan)
 
 
+def compared(args, name):
+    """The figure, and what the decrease condition adds."""
+    forest(args, name)
+    improvements(args, name, COMPARED[0])
+
+
 if __name__ == "__main__":
     args = options(__doc__, task="rendezvous-path5", steps=7_680_000, episodes=STARTS)
-    experiment("model-based", list(cases(args)), args)
+    experiment("model-based", list(cases(args)), args, compared)
     if not (args.quick or args.draw or args.list):
         game = TASKS[args.task]
         by_hand = evaluate(game, CONTROLLERS["tree-pursuit"](game), args.episodes)

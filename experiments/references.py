@@ -1,4 +1,4 @@
-"""Every algorithm at the same budget: references, controls and both of the paper's.
+"""Every algorithm that learns from transitions, at one budget: references, controls, the paper's.
 
 ./run python experiments/references.py
 ./run python experiments/references.py --task rendezvous-path5 --steps 409600
@@ -6,12 +6,15 @@
 
 from common import Case, experiment, options, schedule
 
+from marlyap.algorithm import AbstractOffPolicy
 from marlyap.algorithms import ALGORITHMS
 from marlyap.tasks import TASKS
 
 
 def cases(args):
     for name, algorithm in ALGORITHMS.items():
+        if not isinstance(algorithm, AbstractOffPolicy):  # model_based.py has those
+            continue
         about = {"task": args.task, "algorithm": name, "budget": args.steps}
         yield Case(about, TASKS[args.task], algorithm, schedule(args))
 

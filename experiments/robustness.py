@@ -1,7 +1,7 @@
 """Trained policies in a game that is not quite the one they were made for.
 
-The policies are those of headline.py (trained here if they are not there), and the hand-written
-tree pursuit beside them; all from the same fresh starts.
+The policies are those of headline.py (trained here if they are not there), but for the strict
+condition's, and the hand-written tree pursuit beside them; all from the same fresh starts.
 
     ./run python experiments/robustness.py
 """
@@ -23,6 +23,7 @@ from common import (
 )
 from headline import cases
 
+from marlyap import statistics
 from marlyap.certificates.robustness import moved
 from marlyap.controllers import CONTROLLERS
 from marlyap.perturb import Perturbed, edge_to_cut, follower_to_lose, traced
@@ -45,6 +46,7 @@ MEANING = {
     "gone": "without an agent",
     "cut": "without an edge",
 }
+WHOSE = ("masac", "masac-lyapunov", "masac-critic")
 COLUMNS = ["task", "algorithm", "seed", "perturbation", "level"]
 
 
@@ -63,7 +65,7 @@ def perturbed(game, quick):
 
 def teams(args):
     """(name, seed, controller) of all that is to be disturbed."""
-    chosen = only(cases(args), args)
+    chosen = [case for case in only(cases(args), args) if case.label in WHOSE]
     if args.quick:
         chosen = [case.quick() for case in chosen[:1]]
     for case in chosen:
@@ -89,6 +91,17 @@ def table(args):
                 put(args, name, COLUMNS, [about | counted(final <= RADIUS)])
 
 
+def beside(kind, algorithm, points, algorithms):
+    """How probably a policy of this algorithm succeeds more often than one of those before it."""
+    for other in list(algorithms)[: list(algorithms).index(algorithm)]:
+        for level, rows in algorithms[other].items():
+            a, b = points[level].seeds, estimate(rows).seeds
+            if len(a) == len(b) > 1:
+                p, (low, high) = statistics.probability_of_improvement(a, b)
+                said = f"P({algorithm} above {other}) = {p:.2f} [{low:.2f}, {high:.2f}]"
+                print(f"{kind} {level:<5} {said}")
+
+
 def curves(args):
     """A panel for each kind of perturbation, a line for each algorithm."""
     found = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
@@ -101,6 +114,7 @@ def curves(args):
             for level, e in points.items():
                 interval = f"{e.mean:.3f} [{e.low:.3f}, {e.high:.3f}]"
                 print(f"{kind} {level:<5} {algorithm:<16} {interval}, {len(e.seeds)} policies")
+            beside(kind, algorithm, points, algorithms)
             x = [float(level) if kind in KINDS else level for level in points]
             (line,) = axes.plot(x, [e.mean for e in points.values()], ".-", label=algorithm)
             ends = [[e.low for e in points.values()], [e.high for e in points.values()]]

@@ -14,7 +14,7 @@ from marlyap.tasks import TASKS
 
 COMPARED = ("masac", "masac-lyapunov")
 SIZES = (
-    *[(n, "complete", 1) for n in (2, 3, 4, 5, 6, 8)],
+    *[(n, "complete", 1) for n in range(2, 9)],
     *[(n, "path", 1) for n in (3, 4, 5)],
     *[(5, graph, 1) for graph in ("ring", "star")],
     *[(5, "path", leaders) for leaders in (2, 5)],

@@ -44,22 +44,25 @@ def placed(tree: Tree, several: bool, mesh: Mesh | None) -> Tree:
 
 def kept(tree: Tree, several: bool) -> Tree:
     """Inside a compiled function: what it returns stays where `placed` put it."""
-    if jax.sharding.get_abstract_mesh().empty:
-        return tree
-    stay = lambda x: jax.lax.with_sharding_constraint(x, _spec(several))
-    return jax.tree.map(lambda x: stay(x) if eqx.is_array(x) else x, tree)
+    return _constrained(tree, _spec(several))
+
+
+def spread(keys: Keys) -> Keys:
+    """Inside a compiled function: share out what is played with these keys over a run's devices."""
+    return _constrained(keys, PartitionSpec(EPISODES))
+
+
+def gathered(tree: Tree) -> Tree:
+    """Inside a compiled function: all that a run's devices have played, on each of them."""
+    return _constrained(tree, PartitionSpec())
 
 
 def _spec(several: bool) -> PartitionSpec:
     return PartitionSpec(RUNS) if several else PartitionSpec()
 
 
-def spread(keys: Keys) -> Keys:
-    """Inside a compiled function: share out what is played with these keys over a run's devices.
-
-    They stay together where the devices do not go into their number.
-    """
-    devices = jax.sharding.get_abstract_mesh().shape.get(EPISODES, 1)
-    if devices == 1 or keys.shape[0] % devices:
-        return keys
-    return jax.lax.with_sharding_constraint(keys, PartitionSpec(EPISODES))
+def _constrained(tree: Tree, spec: PartitionSpec) -> Tree:
+    if RUNS not in jax.sharding.get_abstract_mesh().axis_names:
+        return tree
+    hold = lambda x: jax.lax.with_sharding_constraint(x, spec) if eqx.is_array(x) else x
+    return jax.tree.map(hold, tree)

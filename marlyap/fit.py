@@ -210,9 +210,22 @@ class _Saved:
 
 
 def _stack(carries: list[Carry]) -> Carry:
-    """A leading axis for several runs; one alone stays as it is, or XLA would copy its memory."""
-    join = lambda *xs: jnp.stack(xs) if eqx.is_array(xs[0]) else xs[0]
-    return jax.tree.map(join, *carries) if len(carries) > 1 else carries[0]
+    """A leading axis for several runs; one alone stays as it is, or XLA would copy its memory.
+
+    The carries are used up: with several runs nobody keeps their replay memories twice.
+    """
+    if len(carries) == 1:
+        return carries[0]
+
+    def join(*xs):
+        if not eqx.is_array(xs[0]):
+            return xs[0]
+        joined = jnp.stack(xs)
+        for x in xs:
+            x.delete()
+        return joined
+
+    return jax.tree.map(join, *carries)
 
 
 def _row(carry: Carry, i: int) -> Carry:

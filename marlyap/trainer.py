@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
 from marlyap.algorithm import AbstractAlgorithm, AbstractModelBased, AbstractOffPolicy
-from marlyap.devices import spread
+from marlyap.devices import gathered, spread
 from marlyap.errors import within
 from marlyap.evaluation import outcomes
 from marlyap.game import AbstractGame
@@ -130,7 +130,7 @@ class Trainer(eqx.Module):
             seen = jax.tree.map(lambda x: x[None], watch(learner))
         else:
             assert isinstance(a, AbstractOffPolicy)
-            new = self.play(a.explore(carry.learner), k_play, self.schedule.environments)
+            new = gathered(self.play(a.explore(carry.learner), k_play, self.schedule.environments))
             memory = memory.add(new)
             learner, info, seen = self.learn(carry.learner, memory, k_learn, decay, watch)
             info["return"] = jnp.mean(jnp.sum(jnp.mean(new.reward, axis=2), axis=1))

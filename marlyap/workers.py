@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from marlyap.errors import UserError
-from marlyap.fit import fit
+from marlyap.fit import Diverged, fit
 from marlyap.run import Run
 
 
@@ -69,8 +69,8 @@ def train_all(runs: list[Run], args: Namespace) -> int:
         if args.worker:
             for event in fit(runs, stop, attempts):
                 print(json.dumps(event), flush=True)
-        elif len(runs) == 1 or (vmapped and _alike(runs)):
-            _show(fit(runs, stop, attempts), runs)
+        elif len(runs) == 1 or vmapped:
+            _show(_side_by_side(runs, stop, attempts), runs)
         else:
             _show(_processes(runs, stop, args), runs)
     if stop.signal:
@@ -79,8 +79,25 @@ def train_all(runs: list[Run], args: Namespace) -> int:
     return stop.code
 
 
-def _alike(runs: list[Run]) -> bool:
-    return all(r.trainer == runs[0].trainer and r.steps_done == runs[0].steps_done for r in runs)
+def _side_by_side(runs: list[Run], stop: Stop, attempts: int) -> Iterator[dict[str, Any]]:
+    """Runs that differ in their seed alone in one program; one such group after the other.
+
+    Raises UserError at the end if a number stopped being finite in any of them.
+    """
+    failed: list[str] = []
+    while runs:
+        group = [run for run in runs if run.trainer == runs[0].trainer]
+        runs = [run for run in runs if run.trainer != group[0].trainer]
+        says: dict[int, str] = {}
+        try:
+            for event in fit(group, stop, attempts):
+                says |= {event["seed"]: event["says"]} if "diverged" in event else {}
+                yield event
+        except Diverged as error:
+            failed.append(str(error))
+        failed += [says[run.seed] for run in group if not run.finished and run.seed in says]
+    if failed:
+        raise UserError(failed[0])
 
 
 def _show(events: Iterable[dict[str, Any]], runs: list[Run]) -> None:
@@ -146,7 +163,8 @@ def _processes(runs: list[Run], stop: Stop, args: Namespace) -> Iterator[dict[st
             )
         elif code not in (0, 130, 143):  # the other seeds go on
             said = child.stderr.read().strip().removeprefix("marlyap: ") if child.stderr else ""
-            failed.append(said.splitlines()[-1] if said else f"{run.directory}: training failed.")
+            ended = f"{run.directory}: its process ended with code {code}; train --resume goes on."
+            failed.append(said.splitlines()[-1] if said else ended)
     if failed:
         raise UserError(failed[0])
 

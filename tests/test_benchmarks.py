@@ -48,8 +48,6 @@ def test_quick(name, benchmarks, tmp_path, capsys):
     if name == "update":  # no matrix product is computed twice, and none for nothing
         for row in written["rows"]:
             assert row["done MFLOP"] <= 1.001 * row["needed MFLOP"]
-    if name == "agents":
-        assert written["rows"][-1]["growth of work"] < 1.05
 
 
 @pytest.mark.slow

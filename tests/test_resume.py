@@ -15,6 +15,7 @@ import time
 from argparse import Namespace
 from collections import deque
 from pathlib import Path
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -454,6 +455,32 @@ def test_a_process_that_fails_leaves_the_other_seeds_alone(tmp_path, monkeypatch
         for event in workers._processes(runs, workers.Stop(), Namespace()):
             events.append(event)
     assert events == [{"seed": 6}]
+
+
+def test_runs_side_by_side_go_by_their_settings_and_faults_are_told_at_the_end(monkeypatch):
+    """On a GPU: one program for runs that differ in their seed alone, the next one after it."""
+    run = lambda trainer, seed, done=True: SimpleNamespace(
+        trainer=trainer, seed=seed, finished=done, directory=Path(f"{trainer}{seed}")
+    )
+    groups = []
+
+    def fit(group, stop, attempts):
+        groups.append([(r.trainer, r.seed) for r in group])
+        for r in group:
+            event = {"seed": r.seed, "steps": 8}
+            yield event if r.finished else event | {"diverged": "J_Q", "says": f"{r.directory}!"}
+        if not any(r.finished for r in group):
+            raise Diverged("all of c!")
+
+    monkeypatch.setattr(workers, "fit", fit)
+    together = lambda runs: list(workers._side_by_side(runs, workers.Stop(), 1))
+    assert together([run("a", 0), run("b", 0), run("a", 1)]) == [
+        {"seed": s, "steps": 8} for s in (0, 1, 0)
+    ]
+    assert groups == [[("a", 0), ("a", 1)], [("b", 0)]]
+    with pytest.raises(UserError, match="^b1!$"):
+        together([run("b", 1, False), run("b", 2), run("c", 3, False), run("d", 4)])
+    assert groups[2:] == [[("b", 1), ("b", 2)], [("c", 3)], [("d", 4)]]
 
 
 # --- Two at once, signals and kills --------------------------------------------------------------
