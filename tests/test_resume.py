@@ -15,7 +15,6 @@ import time
 from argparse import Namespace
 from collections import deque
 from pathlib import Path
-from types import SimpleNamespace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -459,9 +458,16 @@ def test_a_process_that_fails_leaves_the_other_seeds_alone(tmp_path, monkeypatch
 
 def test_runs_side_by_side_go_by_their_settings_and_faults_are_told_at_the_end(monkeypatch):
     """On a GPU: one program for runs that differ in their seed alone, the next one after it."""
-    run = lambda trainer, seed, done=True: SimpleNamespace(
-        trainer=trainer, seed=seed, finished=done, directory=Path(f"{trainer}{seed}")
-    )
+
+    class Known(Run):
+        finished = property(lambda self: self.done)
+
+        def __init__(self, trainer, seed, done=True):
+            vars(self).update(
+                trainer=trainer, seed=seed, done=done, directory=Path(f"{trainer}{seed}")
+            )
+
+    run = Known
     groups = []
 
     def fit(group, stop, attempts):
