@@ -280,8 +280,8 @@ def estimate(rows: Iterable[Row]) -> Estimate:
     return Estimate(statistics.iqm(rates), low, high, rates)
 
 
-def estimates(args: argparse.Namespace, name: str) -> dict[str, dict[str, Estimate]]:
-    """For each measure, the estimate of each case, in the order of the tables."""
+def measured(args: argparse.Namespace, name: str) -> dict[str, dict[str, list[Row]]]:
+    """For each measure, the rows of each case, in the order of the tables."""
     success = [row for row in read(args, f"{name}-success") if row["radius"] in ("0.05", "0.1")]
     contraction = read(args, f"{name}-contraction")
     groups: dict[str, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
@@ -289,12 +289,13 @@ def estimates(args: argparse.Namespace, name: str) -> dict[str, dict[str, Estima
         groups[f"success within {row['radius']} m"][case].append(row)
     for row, case in zip(contraction, labels(contraction), strict=True):
         groups[f"cost falls by {row['beta']} in {row['T']} steps"][case].append(row)
-    return {m: {c: estimate(rows) for c, rows in by.items()} for m, by in groups.items()}
+    return groups
 
 
 def forest(args: argparse.Namespace, name: str) -> None:
     """The figure, and the same on standard output: a line a case, a panel a measure."""
-    found = estimates(args, name)
+    tables = measured(args, name)
+    found = {m: {c: estimate(rows) for c, rows in by.items()} for m, by in tables.items()}
     for measure, cases in found.items():
         print(f"{name}, {measure}: interquartile mean over seeds, 95 % interval, worst seed")
         for case, e in cases.items():
@@ -316,11 +317,11 @@ def forest(args: argparse.Namespace, name: str) -> None:
 
 def improvements(args: argparse.Namespace, name: str, plain: str) -> None:
     """On standard output: how probably each case is above the plain one, measure by measure."""
-    for measure, cases in estimates(args, name).items():
-        for case, e in cases.items():
-            if case == plain or plain not in cases:
-                continue
-            p, (low, high) = statistics.probability_of_improvement(e.seeds, cases[plain].seeds)
+    rates = lambda rows: [float(row["success_rate"]) for row in rows]
+    for measure, cases in measured(args, name).items():
+        for case in [c for c in cases if c != plain and plain in cases]:
+            better = statistics.probability_of_improvement
+            p, (low, high) = better(rates(cases[case]), rates(cases[plain]))
             print(f"P({case} above {plain}) = {p:.2f} [{low:.2f}, {high:.2f}], {measure}")
 
 
