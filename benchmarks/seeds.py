@@ -62,7 +62,7 @@ def child(args):
 
 def main(argv=None):
     args = harness.arguments(
-        argv, __doc__, seeds=[1, 2, 4], ways=["process", "vmap", "map"], rounds=8, child=0
+        argv, __doc__, seeds=[1, 2, 4, 16], ways=["process", "vmap", "map"], rounds=8, child=0
     )
     if args.quick:
         args.seeds, args.rounds = [1, 2], 1

@@ -15,6 +15,7 @@ from common import Case, experiment, forest, improvements, options, schedule
 from marlyap.algorithms import MASAC
 from marlyap.constraints import Lyapunov
 from marlyap.tasks import TASKS
+from marlyap.trainer import SCHEDULES
 
 
 HAN = Lyapunov()
@@ -45,4 +46,5 @@ def compared(args, name):
 
 if __name__ == "__main__":
     args = options(__doc__)
-    experiment("forms", list(cases(args)), args, compared)
+    name = "forms" if args.steps == SCHEDULES["tuned"].steps else f"forms-{args.steps}"
+    experiment(name, list(cases(args)), args, compared)
