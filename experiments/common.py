@@ -117,6 +117,11 @@ def only(cases: Iterable[Case], args: argparse.Namespace) -> list[Case]:
     return chosen
 
 
+def at_budget(name: str, args: argparse.Namespace) -> str:
+    """The name, and the budget where it is not the tuned schedule's."""
+    return name if args.steps == SCHEDULES["tuned"].steps else f"{name}-{args.steps}"
+
+
 def schedule(args: argparse.Namespace, **changes: Any) -> Schedule:
     """The tuned schedule at the budget asked for."""
     return replace(SCHEDULES["tuned"], steps=args.steps, **changes)
@@ -127,8 +132,12 @@ def experiment(
     cases: Sequence[Case],
     args: argparse.Namespace,
     draw: Callable[[argparse.Namespace, str], None] | None = None,
+    plain: str = "",
 ) -> None:
-    """Train what is missing, measure it, and draw the figure from the tables."""
+    """Train what is missing, measure it, and draw the figure from the tables.
+
+    With `plain`, the other cases are held against the one of that name.
+    """
     cases = only(cases, args)
     if args.list:
         print(*(case.label for case in cases), sep="\n")
@@ -143,6 +152,8 @@ def experiment(
     name = f"{name}-{args.task}"
     export(name, args)
     (draw or forest)(args, name)
+    if plain:
+        improvements(args, name, plain)
 
 
 def fill(name: str, cases: Sequence[Case], args: argparse.Namespace) -> None:

@@ -10,17 +10,16 @@ learnt from its own slow copy and not from whole rollouts; or L must fall by hal
 
 from dataclasses import replace
 
-from common import Case, experiment, forest, improvements, options, schedule
+from common import Case, at_budget, experiment, options, schedule
 
 from marlyap.algorithms import MASAC
-from marlyap.constraints import Lyapunov
+from marlyap.constraints import Lyapunov, Unconstrained
 from marlyap.tasks import TASKS
-from marlyap.trainer import SCHEDULES
 
 
 HAN = Lyapunov()
 FORMS = {
-    "none": None,
+    "none": Unconstrained(),
     "han": HAN,
     "floor-0.3": replace(HAN, floor=0.3),
     "weight-1": replace(HAN, weight=1.0),
@@ -38,13 +37,6 @@ def cases(args):
         yield Case(about, TASKS[args.task], MASAC(constraint=L), schedule(args))
 
 
-def compared(args, name):
-    """The figure, and who is better than plain MASAC."""
-    forest(args, name)
-    improvements(args, name, "none")
-
-
 if __name__ == "__main__":
     args = options(__doc__)
-    name = "forms" if args.steps == SCHEDULES["tuned"].steps else f"forms-{args.steps}"
-    experiment(name, list(cases(args)), args, compared)
+    experiment(at_budget("forms", args), list(cases(args)), args, plain="none")

@@ -15,13 +15,12 @@ Runs are kept in --runs and gone on with when the script is started again.
 
 from collections import defaultdict
 
-from common import Case, experiment, forest, improvements, options, read, schedule
+from common import Case, at_budget, experiment, forest, options, read, schedule
 
 from marlyap import draw
 from marlyap.algorithms import ALGORITHMS, MASAC
 from marlyap.constraints import Lyapunov
 from marlyap.tasks import TASKS
-from marlyap.trainer import SCHEDULES
 
 
 COMPARED = ("masac", "masac-lyapunov")
@@ -38,7 +37,7 @@ def cases(args):
 
 
 def curves(args, name):
-    """The paper's two figures, and who is the better."""
+    """The paper's two figures."""
     forest(args, name)
     points = defaultdict(list)
     for row in read(args, f"{name}-curves"):
@@ -54,10 +53,8 @@ def curves(args, name):
         for (algorithm, seed), rows in points.items()
     ]
     draw.learning_curves_png(runs, args.results / f"{name}-curves.png")
-    improvements(args, name, COMPARED[0])
 
 
 if __name__ == "__main__":
     args = options(__doc__, seeds=range(10))
-    name = "headline" if args.steps == SCHEDULES["tuned"].steps else f"headline-{args.steps}"
-    experiment(name, list(cases(args)), args, curves)
+    experiment(at_budget("headline", args), list(cases(args)), args, curves, COMPARED[0])

@@ -15,8 +15,6 @@ from common import (
     Case,
     counted,
     experiment,
-    forest,
-    improvements,
     options,
     read,
 )
@@ -40,15 +38,9 @@ def cases(args):
         yield Case(about, TASKS[args.task], algorithm, plan)
 
 
-def compared(args, name):
-    """The figure, and what the decrease condition adds."""
-    forest(args, name)
-    improvements(args, name, COMPARED[0])
-
-
 if __name__ == "__main__":
     args = options(__doc__, task="rendezvous-path5", steps=7_680_000, episodes=STARTS)
-    experiment("model-based", list(cases(args)), args, compared)
+    experiment("model-based", list(cases(args)), args, plain=COMPARED[0])
     if not (args.quick or args.draw or args.list):
         game = TASKS[args.task]
         by_hand = evaluate(game, CONTROLLERS["tree-pursuit"](game), args.episodes)

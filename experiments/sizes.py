@@ -6,9 +6,10 @@
 
 from dataclasses import replace
 
-from common import Case, experiment, options, schedule
+from common import Case, experiment, forest, measured, options, schedule
 
 from marlyap.algorithms import ALGORITHMS
+from marlyap.statistics import iqm, mcnemar
 from marlyap.tasks import TASKS
 
 
@@ -31,6 +32,20 @@ def cases(args):
             yield Case(about, game, ALGORITHMS[name], schedule(args))
 
 
+def drawn(args, name):
+    """The figure, and in how many games the Lyapunov term is the better."""
+    forest(args, name)
+    plain, term = COMPARED
+    for measure, tables in measured(args, name).items():
+        rates = {c: iqm([float(r["success_rate"]) for r in rows]) for c, rows in tables.items()}
+        others = {c: c.replace(plain, term, 1) for c in rates if c.split()[0] == plain}
+        pairs = [(rates[a], rates[b]) for a, b in others.items() if b in rates]
+        if pairs:
+            test = mcnemar([b > a for a, b in pairs], [b < a for a, b in pairs])
+            said = f"better in {test.only_a}, worse in {test.only_b} of {len(pairs)} games"
+            print(f"{term}: {said} (sign test p = {test.p_value:.4f}), {measure}")
+
+
 if __name__ == "__main__":
     args = options(__doc__, seeds=range(3))
-    experiment("sizes", list(cases(args)), args)
+    experiment("sizes", list(cases(args)), args, drawn)
