@@ -1,10 +1,12 @@
 """Forms of the Lyapunov condition that keep their say, beside the paper's and the control.
 
 The learnt weight of Delta L fades once the condition holds on average. Each case changes one thing:
-the weight may not fall below a floor, or is fixed; the condition holds only outside the ball; L is
-learnt from its own slow copy and not from whole rollouts; or L must fall by half of the cost.
+the weight may not fall below a floor, or is fixed; the condition holds only outside the ball, or is
+about the followers alone; L is learnt from its own slow copy and not from whole rollouts; or L must
+fall by half of the cost.
 
     ./run python experiments/forms.py --steps 51200
+    ./run python experiments/forms.py --task rendezvous-path5
     ./run python experiments/forms.py --steps 409600 --only weight-1 --seeds 0 1 2 3 4 5 6 7 8 9
 """
 
@@ -32,9 +34,12 @@ FORMS = {
 
 
 def cases(args):
-    for name, L in FORMS.items():
+    game = TASKS[args.task]
+    followers = tuple(i for i in range(game.agents) if i not in game.leaders)
+    forms = FORMS | {"followers": replace(HAN, agents=followers, weight=1.0)}
+    for name, L in forms.items():
         about = {"task": args.task, "form": name, "budget": args.steps}
-        yield Case(about, TASKS[args.task], MASAC(constraint=L), schedule(args))
+        yield Case(about, game, MASAC(constraint=L), schedule(args))
 
 
 if __name__ == "__main__":

@@ -18,6 +18,9 @@ class AbstractAlgorithm(eqx.Module):
     differentiating the game itself.
     """
 
+    def fits(self, agents: int) -> None:
+        """Raise UserError if it cannot train a team of so many agents; the default takes any."""
+
     @abc.abstractmethod
     def init(self, shape: Shape, key: Key) -> PyTree:
         """Fresh parameters and optimiser memories."""

@@ -18,6 +18,9 @@ class AbstractConstraint(eqx.Module):
     def foresight(self) -> tuple[int, bool]:
         """T of L_target, and whether episodes are to be rolled T steps further to have it."""
 
+    def fits(self, agents: int) -> None:
+        """Raise UserError if it cannot be asked of a team of so many agents."""
+
     @abc.abstractmethod
     def init(self, shape: Shape, key: Key) -> PyTree:
         """What the constraint learns, before it has learnt anything."""

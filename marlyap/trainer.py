@@ -86,6 +86,9 @@ class Trainer(eqx.Module):
     algorithm: AbstractAlgorithm
     schedule: Schedule
 
+    def __check_init__(self):
+        self.algorithm.fits(self.game.agents)
+
     @property
     def steps_per_iteration(self) -> int:
         return self.schedule.environments * self.game.horizon

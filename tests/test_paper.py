@@ -22,6 +22,8 @@ from marlyap.errors import UserError
 from marlyap.learn import Learnt, polyak
 from marlyap.nets import MLP, Actors, Critic, Greedy, LyapunovNet, NormNet, Sampled, Shape
 from marlyap.rollout import Decentralised, cost_to_go, rollout
+from marlyap.tasks import TASKS
+from marlyap.trainer import Schedule, Trainer
 
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -696,6 +698,33 @@ def test_the_constraint_holds_outside_the_ball_only(certificate, batch, drawn):
     outside = np.mean(batch.cost, axis=1) > ball
     assert 0 < outside.sum() < 16
     np.testing.assert_allclose(got, np.where(outside, everywhere, 0), rtol=1e-6)
+
+
+def test_a_constraint_about_some_agents_alone(certificate, batch, drawn):
+    """Their costs enter, and their actions alone feel it; what the others did is as it was."""
+    L, some = certificate["squares"], (1, 2)
+    got, whole = (Lyapunov(weight=1.0, agents=agents) for agents in (some, ()))
+    costs, rest = np.mean(batch.cost[:, 1:], axis=1), np.mean(batch.cost, axis=1)
+    more = penalties(got, L, batch, *drawn) - penalties(whole, L, batch, *drawn)
+    np.testing.assert_allclose(more, got.decrease * (costs - rest), atol=1e-4)
+    one = jax.tree.map(lambda x: x[0], batch)
+    L_target = got.L_target(L, one, jax.tree.map(lambda x: x[0], drawn[1]))
+    np.testing.assert_allclose(L_target, np.mean(one.cost_to_go[1:]), rtol=1e-6)
+    ones = np.ones(len(costs), np.float32)
+    felt, free = (to_actions(c, L, batch, *drawn, ones)[1].action for c in (got, whole))
+    assert np.all(felt[:, 0] == 0) and np.any(free[:, 0] != 0)
+    np.testing.assert_array_equal(felt[:, 1:], free[:, 1:])
+    score = Lyapunov(reading="score", function="norm", weight=1.0, agents=some)
+    now, _ = to_actions(score, certificate["norm"], batch, *drawn, ones)
+    feels = np.any(np.asarray(now.log_prob_memory) != 0, axis=0)
+    assert not feels[0] and feels[1:].all()
+
+
+def test_a_constraint_about_agents_that_are_not_there():
+    with pytest.raises(UserError, match="^agents: 3 is out of range; take 0 to 2"):
+        Trainer(TASKS["rendezvous"], MASAC(constraint=Lyapunov(agents=(1, 3))), Schedule())
+    with pytest.raises(UserError, match="^agents: .* names an agent twice"):
+        Lyapunov(agents=(1, 1))
 
 
 def test_slope_estimates(certificate, batch):

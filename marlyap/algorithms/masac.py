@@ -81,6 +81,9 @@ class MASAC(AbstractOffPolicy):
     def foresight(self):
         return self.constraint.foresight
 
+    def fits(self, agents):
+        self.constraint.fits(agents)
+
     def init(self, shape, key):
         k_pi, k_Q, k_L = jax.random.split(key, 3)
         pi = Actors(shape, self.actor_width, self.shared, key=k_pi)

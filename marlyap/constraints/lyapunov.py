@@ -28,7 +28,7 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from marlyap.constraint import AbstractConstraint
 from marlyap.errors import UserError, within
@@ -60,6 +60,7 @@ class Lyapunov(AbstractConstraint):
     weight_start: float = 1.0  # the learnt weight to begin with
     floor: float = 1e-3  # smallest learnt weight
     ball: float = 0.0  # the constraint holds only where the team's cost exceeds this (m)
+    agents: tuple[int, ...] = ()  # whose costs and actions it is about; empty: everybody's
     slope: float | Literal["empirical", "spectral"] = 0.0  # l_L l_f, or how to estimate l_L
     input_gain: float = 0.505  # l_f per unit of action: 0.101 for the unicycle at 0.1 s, times 5
     clip: float = 0.2  # the ratio of `score` stays within 1 -+ this
@@ -86,10 +87,16 @@ class Lyapunov(AbstractConstraint):
         for name in ("ball", "clip", "rate_L", "rate_weight", "weight", "slope"):
             if isinstance(value := getattr(self, name), float | int):
                 within(name, value, 0, 1e6)
+        if len(set(self.agents)) != len(self.agents):
+            raise UserError(f"agents: {self.agents} names an agent twice.")
 
     @property
     def foresight(self):
         return self.horizon, self.target == "rollout"
+
+    def fits(self, agents):
+        for i in self.agents:
+            within("agents", i, 0, agents - 1)
 
     def init(self, shape, key):
         make = LyapunovNet if self.function == "squares" else NormNet
@@ -103,6 +110,7 @@ class Lyapunov(AbstractConstraint):
 
     def penalty(self, L, b, now, nxt):
         """weight * Delta L of one transition, eq. (14), in the chosen reading."""
+        now, nxt = self.held(now), self.held(nxt)
         net, moved = L.net.value, distance(now.action, b.action)
         if self.reading == "han":
             term = self.rise(L, b, nxt.action)
@@ -116,7 +124,7 @@ class Lyapunov(AbstractConstraint):
             term = net(b.features, now.action)
         else:
             fall = net(b.features, b.action) - net(b.next_features, b.action)
-            advantage = (fall - self.decrease * jnp.mean(b.cost)) / jnp.sqrt(L.scale)
+            advantage = (fall - self.decrease * self.team(b.cost)) / jnp.sqrt(L.scale)
             term = self.surrogate(now, b, jax.lax.stop_gradient(advantage))
         return self.multiplier(L) * jnp.where(self.applies(b), term, 0.0)
 
@@ -124,7 +132,7 @@ class Lyapunov(AbstractConstraint):
         """L(s', a') - L(s, a) + decrease c, without Theorem 1's margin."""
         net = L.net.value
         fall = net(b.features, b.action) - net(b.next_features, next_action)
-        return self.decrease * jnp.mean(b.cost) - fall
+        return self.decrease * self.team(b.cost) - fall
 
     def J_L(self, net, b: Transition, nxt: Sample, L: Certificate) -> Scalar:
         """J_L = 1/2 (L(s, a) - L_target)^2, below (14)."""
@@ -132,12 +140,12 @@ class Lyapunov(AbstractConstraint):
 
     def L_target(self, L: Certificate, b: Transition, nxt: Sample) -> Scalar:
         """The sum of the next T costs: as rolled out, or put together from c and the slow L."""
-        now, ahead = jnp.mean(b.cost), jnp.mean(b.cost_ahead)
+        now, ahead = self.team(b.cost), self.team(b.cost_ahead)
         if self.target == "bootstrap":
             return now - ahead + L.net_bar(b.next_features, nxt.action)
         if self.target == "discounted":
             return now + self.discount * L.net_bar(b.next_features, nxt.action)
-        return jnp.mean(b.cost_to_go)
+        return self.team(b.cost_to_go)
 
     def update(self, L, b, now, nxt, decay):
         """psi <- psi - iota_L grad J_L, and the dual step on the weight."""
@@ -169,7 +177,20 @@ class Lyapunov(AbstractConstraint):
 
     def applies(self, b: Transition) -> Array:
         """Whether the constraint is asked for here: outside the ball."""
-        return jnp.mean(b.cost) > self.ball if self.ball > 0 else jnp.asarray(True)
+        return self.team(b.cost) > self.ball if self.ball > 0 else jnp.asarray(True)
+
+    def team(self, per_agent: Float[Array, "agent"]) -> Scalar:
+        """The mean over the agents that the constraint is about."""
+        return jnp.mean(per_agent[jnp.array(self.agents)] if self.agents else per_agent)
+
+    def held(self, drawn: Sample) -> Sample:
+        """Drawn actions of which only those of the agents the constraint is about can yield."""
+        if not self.agents:
+            return drawn
+        everyone = jnp.arange(drawn.action.shape[0])
+        mine = jnp.isin(everyone, jnp.array(self.agents))[:, None]
+        action = jnp.where(mine, drawn.action, jax.lax.stop_gradient(drawn.action))
+        return drawn._replace(action=action)
 
     def lipschitz(self, L: Certificate) -> Scalar:
         """l_L l_f, the change of L per unit of action."""
@@ -189,7 +210,7 @@ class Lyapunov(AbstractConstraint):
         """-min(ratio A, clipped ratio A), the mean over agents of each one's own ratio."""
         ratio = jnp.exp(jnp.clip(now.log_prob_memory - b.log_prob, -20.0, 20.0))
         near = jnp.clip(ratio, 1 - self.clip, 1 + self.clip)
-        return -jnp.mean(jnp.minimum(ratio * advantage, near * advantage))
+        return -self.team(jnp.minimum(ratio * advantage, near * advantage))
 
 
 def distance(a: Action, b: Action) -> Scalar:
