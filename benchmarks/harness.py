@@ -261,15 +261,24 @@ def ready() -> None:
     sys.stdin.readline()
 
 
-def usage(command: Sequence[str], environment: Mapping[str, str] | None = None) -> Row:
-    """Wall and processor seconds of a whole process, and what it printed."""
+def usage(
+    command: Sequence[str],
+    environment: Mapping[str, str] | None = None,
+    until: Callable[[], bool] | None = None,
+) -> Row:
+    """Wall and processor seconds of a whole process, or until something is there, and its words."""
     wall = time.perf_counter()
     child = subprocess.Popen(
         command, env=os.environ | dict(environment or {}), stdout=PIPE, stderr=PIPE, text=True
     )
+    while until and child.poll() is None:
+        if until():
+            child.kill()
+            break
+        time.sleep(0.005)
     said, wrong = child.stdout.read(), child.stderr.read()
     _, status, used = os.wait4(child.pid, 0)
-    if status:
+    if status and not (until and until()):
         raise SystemExit(f"{' '.join(command)} failed:\n{wrong}")
     return {
         "wall s": time.perf_counter() - wall,

@@ -1,7 +1,8 @@
 """How long until something happens: help, import, the first update, and the same a second time.
 
-Each is a fresh process, the least of several. The first start has an empty cache of compiled
-programs; the second finds there what the first put in.
+Each is a fresh process, the least of several. The first start has an empty cache of programs; the
+second finds there what the first put in. For the first update a training that makes one update an
+iteration is started, and ended when the line of its first iteration is in its log.
 
     python benchmarks/startup.py
 """
@@ -11,6 +12,8 @@ import tempfile
 from pathlib import Path
 
 import harness
+
+from marlyap.programs import FOLDER
 
 
 TRAIN = "train rendezvous masac-lyapunov --seeds 0 --steps"
@@ -23,9 +26,15 @@ def main(argv=None):
     python = [sys.executable]
     rows = []
 
-    def add(name, command, environment=None, repeats=args.repeats):
+    def add(name, command, environment=None, repeats=args.repeats, until=None):
+        """`until` is a file that the command writes: it is timed to its first line, and ended."""
         harness.note(name)
-        runs = [harness.usage([*python, *command], environment) for _ in range(repeats)]
+        there = (lambda: until.is_file() and until.stat().st_size > 0) if until else None
+        runs = []
+        for _ in range(repeats):
+            if until:
+                until.unlink(missing_ok=True)
+            runs.append(harness.usage([*python, *command], environment, there))
         least = {k: min(r[k] for r in runs) for k in ("wall s", "cpu s")}
         rows.append({"what": name} | least)
 
@@ -40,6 +49,12 @@ def main(argv=None):
             add("first training, one iteration", train(0), cache, 1)
             add("the same, programs kept", train(1), cache, 1)
             add("the same again", train(2), cache, 1)
+            one = ["5120", "--schedule.steps_per_update", "2560", "--force", "--out"]
+            first = ["-m", "marlyap", *TRAIN.split(), *one, f"{folder}/one"]
+            log = Path(folder, "one/seed0/log.jsonl")
+            for name, settings in (("", cache), (", traced anew", cache | {FOLDER: ""})):
+                harness.usage([*python, *first], settings)
+                add(f"until its first update{name}", first, settings, args.repeats, log)
     return harness.report("startup", rows, args)
 
 

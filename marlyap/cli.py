@@ -193,7 +193,10 @@ def prepare(args: Any) -> None:
     if device:
         os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": "cuda"}[device]
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_directory()))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # the small ones too
     if args.verb in ("demo", "train"):
+        kept = Path(os.environ["JAX_COMPILATION_CACHE_DIR"], "programs")
+        os.environ.setdefault("MARLYAP_PROGRAMS", str(kept))
         os.environ.setdefault("NPROC", "1")  # products this small lose time to a second thread
     core = os.environ.get("MARLYAP_CORE")
     if core and core.isdigit() and hasattr(os, "sched_setaffinity"):

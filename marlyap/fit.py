@@ -12,14 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from marlyap import devices, store
+from marlyap import devices, programs, store
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.diagnose import diagnose
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.nets import LyapunovNet, NormNet
 from marlyap.rollout import Decentralised, Policy
-from marlyap.run import Run, begin
+from marlyap.run import FROM_TASK, Run, begin
 from marlyap.trainer import Carry, Schedule, Trainer, schedule_for
 
 
@@ -138,12 +138,16 @@ def advance(
     """
     done, mesh = int(np.min(carry.iteration)), devices.mesh_for(carry.iteration.size)
     carry = devices.placed(carry, carry.iteration.ndim > 0, mesh)
+    compiled = lambda f: programs.compiled(f, trainer, carry, lambda: carry, donate=True)
+    iterate = judge = None
     while done < trainer.iterations and not stop():
         done += 1
         with devices.using(mesh):
-            carry, info = _iterate(trainer, carry)
+            iterate = iterate or compiled(_iterate)
+            carry, info = iterate(carry)
             if done % trainer.schedule.judge_every == 0 or done == trainer.iterations:
-                carry, look = _judge(trainer, carry)
+                judge = judge or compiled(_judge)
+                carry, look = judge(carry)
                 info |= look
         yield done, carry, jax.tree.map(np.atleast_1d, info)
 
@@ -245,12 +249,10 @@ def _each(
     return devices.kept(after, several), info
 
 
-@eqx.filter_jit(donate="all-except-first")
 def _iterate(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
     return _each(trainer.iterate, carry)
 
 
-@eqx.filter_jit(donate="all-except-first")
 def _judge(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
     return _each(trainer.judge, carry)
 
@@ -266,9 +268,6 @@ def _line(
         "updates": done * trainer.updates_per_iteration,
         "seconds": round(seconds, 3),
     } | {name: float(values[i]) for name, values in rows.items()}
-
-
-FROM_TASK = ("obs", "features", "reward", "cost")
 
 
 def _fault(line: dict[str, Any]) -> str | None:

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from marlyap import config, seeds, store
+from marlyap import config, programs, seeds, store
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
@@ -32,6 +32,7 @@ from marlyap.trainer import Carry, Schedule, Trainer, shape
 
 
 SCHEMA = 1
+FROM_TASK = ("obs", "features", "reward", "cost")  # numbers that the task answers for
 PACKAGES = ("marlyap", "jax", "jaxlib", "equinox", "optax", "numpy")
 
 
@@ -227,9 +228,11 @@ def _fits(policy: Policy, game: AbstractGame) -> bool:
 
 def begin(trainer: Trainer, seed: int) -> Carry:
     """The state of a fresh run. Raises UserError if the warm-up was not played in numbers."""
-    carry = _begin(trainer, seeds.stream(seed, "train"))
-    for name in ("obs", "features", "reward", "cost"):
-        at = int(first_fault(getattr(carry.memory.episodes, name)))
+    key = seeds.stream(seed, "train")
+    like = lambda: eqx.filter_eval_shape(trainer.begin, key)
+    carry, faults = programs.compiled(_begin, trainer, key, like)(key)
+    for name in FROM_TASK:
+        at = int(faults[name])
         if at >= 0:
             step, agent = divmod(at, trainer.game.agents)
             raise UserError(
@@ -239,9 +242,9 @@ def begin(trainer: Trainer, seed: int) -> Carry:
     return carry
 
 
-@eqx.filter_jit
-def _begin(trainer: Trainer, key: jax.Array) -> Carry:
-    return trainer.begin(key)
+def _begin(trainer: Trainer, key: jax.Array) -> tuple[Carry, dict[str, Any]]:
+    carry = trainer.begin(key)
+    return carry, {name: first_fault(getattr(carry.memory.episodes, name)) for name in FROM_TASK}
 
 
 def expand(paths: Iterable[Path]) -> list[Path]:

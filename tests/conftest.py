@@ -15,6 +15,7 @@ import pytest
 
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+os.environ["MARLYAP_PROGRAMS"] = ""  # a test may change the code that was traced
 
 MAPS = 25_000  # in use when a module ends; one module adds up to 10,000
 

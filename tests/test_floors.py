@@ -21,6 +21,7 @@ FLOORS = """
     statistics
     store
     identity
+    programs
     graph
     threefry
     replica

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap import store, workers
+from marlyap import programs, store, workers
 from marlyap.algorithms import ALGORITHMS, MASAC
 from marlyap.cli import main
 from marlyap.constraints import Lyapunov
@@ -155,13 +155,21 @@ QUICK = ("apg", "matd3")
     "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in EACH]
 )
 @pytest.mark.usefixtures("quick_compilation")
-def test_each_algorithm_and_each_reading_resumes_bit_for_bit(name, uninterrupted, tmp_path):
-    """Cut in mid-decay, when the memory has just been overwritten."""
+def test_each_algorithm_and_each_reading_resumes_bit_for_bit(
+    name, uninterrupted, tmp_path, monkeypatch
+):
+    """Cut in mid-decay, when the memory has just been overwritten; with programs that are kept.
+
+    The uninterrupted run traces its own; the resumed one traces none.
+    """
+    whole = uninterrupted(name, SINGLE)
+    monkeypatch.setenv(programs.FOLDER, str(tmp_path / "programs"))
     (run,) = runs_in(tmp_path, name, SINGLE)
     list(fit([run], until(5)))
     assert run.checkpoints.latest().step == 5
+    monkeypatch.setattr(Trainer, "iterate", None)
     list(fit([Run.open(run.directory)]))
-    assert [final(run)] == uninterrupted(name, SINGLE)
+    assert [final(run)] == whole
 
 
 def test_the_whole_state_is_in_the_checkpoint(uninterrupted):
