@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from argparse import Namespace
-from collections import deque
+from collections import Counter, deque
 from pathlib import Path
 
 import equinox as eqx
@@ -160,9 +160,24 @@ def test_each_algorithm_and_each_reading_resumes_bit_for_bit(
 ):
     """Cut in mid-decay, when the memory has just been overwritten; with programs that are kept.
 
-    The uninterrupted run traces its own; the resumed one traces none.
+    The uninterrupted run traces its own, each once; the resumed one traces none.
     """
-    whole = uninterrupted(name, SINGLE)
+    traces = Counter()
+
+    def counted(part):
+        f = getattr(Trainer, part)
+
+        def trace(self, *args):
+            traces[part] += 1
+            return f(self, *args)
+
+        return trace
+
+    with monkeypatch.context() as patched:
+        for part in ("begin", "iterate", "judge"):
+            patched.setattr(Trainer, part, counted(part))
+        whole = uninterrupted(name, SINGLE)
+    assert traces == {"begin": 1, "iterate": 1, "judge": 1}
     monkeypatch.setenv(programs.FOLDER, str(tmp_path / "programs"))
     (run,) = runs_in(tmp_path, name, SINGLE)
     list(fit([run], until(5)))
