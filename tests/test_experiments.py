@@ -69,7 +69,10 @@ def test_the_quick_form(name, script, places, monkeypatch, capsys):
         rate = int(row["successes"]) / int(row["episodes"])
         assert float(row["success_rate"]) == rate and row["episodes"] == "20"
         assert float(row["low"]) <= rate <= float(row["high"])
-    assert len(table(places, f"{name}-rendezvous-contraction")) == cases * 2
+    contraction = table(places, f"{name}-rendezvous-contraction")
+    assert len(contraction) == cases * 2
+    for row in contraction:  # 98 % of 20 starts are all of them
+        assert (float(row["success_rate"]) == 1) == (float(row["beta98"]) >= float(row["beta"]))
     curves = table(places, f"{name}-rendezvous-curves")
     assert len(curves) == cases * 2 * 2 and all(0 <= float(r["success"]) <= 1 for r in curves)
     picture = places["--results"] / f"{name}-rendezvous.png"
