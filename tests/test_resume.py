@@ -17,6 +17,7 @@ from collections import Counter, deque
 from pathlib import Path
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -582,7 +583,17 @@ class Child:
             self.process.wait()
 
 
+@pytest.fixture
+def full_compilation():
+    """As another process compiles, whatever a test before this one has asked for."""
+    before = jax.config.values["jax_disable_most_optimizations"]
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("full_compilation")
 def test_signals_and_kills_lose_nothing(tmp_path, capsys):
     endless = trainer("masac", ENDLESS)
     run = Run.create(tmp_path / "seed5", endless, 5, NAMES)
