@@ -271,7 +271,9 @@ def usage(
     child = subprocess.Popen(
         command, env=os.environ | dict(environment or {}), stdout=PIPE, stderr=PIPE, text=True
     )
-    while until and child.poll() is None:
+    # Whether it runs is asked without reaping it: its times are read below.
+    runs = lambda: not os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    while until and runs():
         if until():
             child.kill()
             break

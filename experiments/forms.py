@@ -7,6 +7,7 @@ fall by half of the cost.
 
     ./run python experiments/forms.py --steps 51200
     ./run python experiments/forms.py --task rendezvous-path5
+    ./run python experiments/forms.py --only followers --seeds 0 1 2 3 4 5 6 7 8 9
     ./run python experiments/forms.py --steps 409600 --only weight-1 --seeds 0 1 2 3 4 5 6 7 8 9
 """
 

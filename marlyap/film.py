@@ -17,7 +17,7 @@ from marlyap.game import AbstractGame
 from marlyap.identity import policy_hash
 from marlyap.lyapunov_function import CostSum, at_target
 from marlyap.rollout import Controller, rollout
-from marlyap.run import Run, versions
+from marlyap.run import Run
 from marlyap.seeds import Purpose, stream
 from marlyap.types import Key, State, Trajectory
 
@@ -55,7 +55,7 @@ def page(runs: Sequence[Run], episodes: int, seed: int, command: str = "") -> di
         "certificates": certified["certificates"],
         "slices": certified["slices"],
         "config": {part: config.record(value) for part, value in vars(runs[0].trainer).items()},
-        "versions": versions(),
+        "versions": store.versions(),
         "command": command,
         "wall_time_s": sum(
             float(line.get("seconds", 0)) for run in runs for line in run.history()[-1:]

@@ -14,12 +14,10 @@ it has changed since.
 import dataclasses
 import hashlib
 import os
-import platform
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,7 +33,6 @@ from marlyap.identity import plain, words
 
 FOLDER = "MARLYAP_PROGRAMS"
 KIND, MOST = "program", 256  # programs kept, the last ones used
-USES = ("jax", "jaxlib", "equinox", "optax", "numpy")  # what tracing goes through
 
 Tree = TypeVar("Tree")
 Info = dict[str, Any]
@@ -119,10 +116,9 @@ def _surroundings() -> tuple[str, ...]:
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         source.update(path.read_bytes())
     settings = {k: str(v) for k, v in jax.config.values.items() if "cache" not in k}
-    uses = (f"{name} {metadata.version(name)}" for name in USES)
     device = jax.devices()[0]
-    where = (platform.python_version(), platform.machine(), device.platform, device.device_kind)
-    return (source.hexdigest(), str(sorted(settings.items())), *uses, *where)
+    where = (str(store.versions()), device.platform, device.device_kind)
+    return (source.hexdigest(), str(sorted(settings.items())), *where)
 
 
 def _has_shape(x: Any) -> bool:
@@ -130,7 +126,7 @@ def _has_shape(x: Any) -> bool:
 
 
 def _ours(value: Any) -> bool:
-    """Whether all the code in it is this package's, or that of the libraries named above."""
+    """Whether all code in it is this package's, or of libraries whose versions are known."""
     if isinstance(value, eqx.Module):
         inside = [getattr(value, f.name) for f in dataclasses.fields(value)]
         return type(value).__module__.startswith("marlyap.") and all(map(_ours, inside))

@@ -7,12 +7,10 @@ policy/         the best policy so far, and the Lyapunov function: what is evalu
 """
 
 import json
-import platform
 import shutil
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +31,6 @@ from marlyap.trainer import Carry, Schedule, Trainer, shape
 
 SCHEMA = 1
 FROM_TASK = ("obs", "features", "reward", "cost")  # numbers that the task answers for
-PACKAGES = ("marlyap", "jax", "jaxlib", "equinox", "optax", "numpy")
 
 
 @dataclass(frozen=True)
@@ -67,7 +64,7 @@ class Run:
             "seed": seed,
             "names": names,
             "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-            "versions": versions(),
+            "versions": store.versions(),
         }
         try:
             directory.mkdir(parents=True, exist_ok=True)
@@ -293,14 +290,3 @@ def _bits(leaf: jax.Array) -> jax.Array:
 
 def _from_bits(value: jax.Array, dtype: Any) -> jax.Array:
     return jax.random.wrap_key_data(value) if jnp.issubdtype(dtype, jax.dtypes.prng_key) else value
-
-
-def versions() -> dict[str, str]:
-    """Of what a result depends on."""
-    found = {"python": platform.python_version(), "machine": platform.machine()}
-    for name in PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found

@@ -42,6 +42,7 @@ from marlyap.errors import UserError
 
 SCHEMA = 1
 PAYLOAD, MANIFEST = "arrays.safetensors", "manifest.json"
+PACKAGES = ("marlyap", "jax", "jaxlib", "equinox", "optax", "numpy")
 JSON_LIMIT, JSON_DEPTH = 16 * 2**20, 64
 RETRIES = 16  # of reading what others keep replacing
 # NumPy's name of each dtype, and that of safetensors
@@ -298,7 +299,7 @@ def _manifest(kind: str, meta: Mapping[str, Any], payload: list[Any], table: Tab
     files = {PAYLOAD: {"sha256": _sha256(payload), "bytes": size}}
     body = {"schema": SCHEMA, "kind": kind, "meta": dict(meta), "files": files, "arrays": table}
     try:
-        raw = _sealed(body | {"versions": _versions()})
+        raw = _sealed(body | {"versions": versions()})
         _parse(raw)
     except (TypeError, ValueError, RecursionError) as error:
         raise UserError(f"meta is not JSON ({error}); use finite numbers, text, lists.") from error
@@ -314,9 +315,11 @@ def _sealed(body: Mapping[str, Any]) -> bytes:
 
 
 @functools.cache
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for package in ("marlyap", "jax", "equinox", "numpy"):
+def versions() -> dict[str, str]:
+    """Of what a result depends on."""
+    found = {"python": platform.python_version(), "machine": platform.machine()}
+    for package in PACKAGES:
+        found[package] = "not installed"
         with suppress(metadata.PackageNotFoundError):
             found[package] = metadata.version(package)
     return found

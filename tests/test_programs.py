@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -105,9 +106,10 @@ def test_what_surrounds_a_program_belongs_to_its_name(what, folder, monkeypatch,
             (copy / path.name).write_bytes(path.read_bytes() + b"\n" * (path.name == "nets.py"))
         monkeypatch.setattr(programs, "__file__", str(copy / "programs.py"))
     elif what == "version":
-        monkeypatch.setattr(programs.metadata, "version", lambda name: "0")
+        monkeypatch.setattr(programs.store, "versions", lambda: {"jax": "0"})
     elif what == "device":
-        monkeypatch.setattr(programs.platform, "machine", lambda: "abacus")
+        device = SimpleNamespace(platform="abacus", device_kind="beads")
+        monkeypatch.setattr(jax, "devices", lambda: [device])
     try:
         with jax.numpy_dtype_promotion("strict" if what == "setting" else "standard"):
             compiled()

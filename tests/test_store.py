@@ -894,7 +894,7 @@ import os, sys
 from pathlib import Path
 from marlyap import store
 from marlyap.errors import UserError
-store._versions()  # what it imports may be in a home that nobody else can read
+store.versions()  # what it imports may be in a home that nobody else can read
 if os.getuid() == 0:
     os.setuid(65534)
 here = Path(sys.argv[1])
