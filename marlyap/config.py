@@ -49,7 +49,7 @@ def suggest(word: str, among: Iterable[str]) -> str:
     """What may have been meant, or what there is."""
     names = sorted(among)
     near = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
-    return f"did you mean '{near[0]}'?" if near else f"there is {', '.join(names)}."
+    return f"did you mean '{near[0]}'?" if near else f"there is {', '.join(names) or 'none'}."
 
 
 def load(name: str, family: type[T]) -> T:
