@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from marlyap.constraints import Lyapunov as Lyapunov, Unconstrained as Unconstrained
     from marlyap.dynamics import (
         DoubleIntegrator as DoubleIntegrator,
+        LateUnicycle as LateUnicycle,
         SingleIntegrator as SingleIntegrator,
         Unicycle as Unicycle,
     )
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 PUBLIC = {
     "algorithms": ("APG", "MASAC"),
     "constraints": ("Lyapunov", "Unconstrained"),
-    "dynamics": ("DoubleIntegrator", "SingleIntegrator", "Unicycle"),
+    "dynamics": ("DoubleIntegrator", "LateUnicycle", "SingleIntegrator", "Unicycle"),
     "errors": ("UserError",),
     "evaluation": ("compare", "evaluate"),
     "fit": ("train",),

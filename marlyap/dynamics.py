@@ -78,6 +78,10 @@ class AbstractDynamics(eqx.Module):
         u = jnp.clip(action, -1.0, 1.0) * jnp.asarray(self.limits)
         return (semi_implicit_euler if self.integrator == "euler" else rk4)(self, x, u, dt)
 
+    def due(self, x: Float[Array, "dx"], dt: float) -> Float[Array, "dx"]:
+        """The state in which an input asked for now begins to act: x, where none is late."""
+        return x
+
 
 def semi_implicit_euler(
     f: AbstractDynamics, x: Float[Array, "dx"], u: Float[Array, "du"], dt: float
@@ -128,6 +132,26 @@ class Unicycle(AbstractDynamics):
 
     def rates(self, x):
         return x[3:]
+
+
+class LateUnicycle(Unicycle):
+    """A unicycle whose inputs act one step after they were asked for.
+
+    Those under way, a (m/s^2) and r (rad/s^2), are part of its state, and it feels them: without
+    them the next state would not follow from what is known.
+    """
+
+    names: ClassVar[tuple[str, ...]] = (*Unicycle.names, "a", "r")
+
+    def field(self, x, u):
+        return jnp.concatenate([super().field(x[:5], x[5:]), jnp.zeros(2)])
+
+    def step(self, x, action, dt):
+        asked = jnp.clip(action, -1.0, 1.0) * jnp.asarray(self.limits)
+        return super().step(x, action, dt).at[5:].set(asked)
+
+    def due(self, x, dt):
+        return self.step(x, jnp.zeros(2), dt)
 
 
 class DoubleIntegrator(AbstractDynamics):
@@ -182,6 +206,7 @@ class SingleIntegrator(AbstractDynamics):
 
 DYNAMICS = {
     "unicycle": Unicycle(),
+    "late-unicycle": LateUnicycle(),
     "double-integrator": DoubleIntegrator(),
     "single-integrator": SingleIntegrator(),
 }

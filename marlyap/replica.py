@@ -13,7 +13,13 @@ from marlyap.errors import UserError
 from marlyap.threefry import fold, normal, uniform
 
 
-KNOWN = {"Unicycle": 5, "DoubleIntegrator": 4, "SingleIntegrator": 2}  # numbers in a state
+# Numbers in a state, and those of them that an input drives.
+KNOWN = {
+    "Unicycle": (5, slice(3, 5)),
+    "LateUnicycle": (7, slice(3, 5)),
+    "DoubleIntegrator": (4, slice(2, 4)),
+    "SingleIntegrator": (2, slice(0, 2)),
+}
 MOST = 5 * 10**7  # agent-steps of the longest set of rollouts that is played: 2 GB
 
 
@@ -34,6 +40,7 @@ class Replica:
         self.arrays, self.cache, self.seed = arrays, {}, meta["seed"]
         model = self.game.get("dynamics", {})
         self.kind, self.limits = model.get("kind"), np.array(model.get("limits", []))
+        self.turns = "Unicycle" in str(self.kind)
         world = self.game["kind"], self.controller["kind"], model.get("integrator")
         world += self.kind in KNOWN and self.controller["policy"]["kind"], self.game["graph"][:4]
         if world[:4] != ("Rendezvous", "Decentralised", "euler", "Greedy") or world[4] == "disk":
@@ -54,9 +61,9 @@ class Replica:
         """States [episode, agent, .], goals, and the stream of each episode's disturbances."""
         key, size = fold(self.keys(episodes), 0), self.game["size"]
         draw = lambda i, *shape: 2.0 * uniform(fold(key, i), *shape) - 1
-        x = np.zeros((len(key[0]), len(self.slots), KNOWN[self.kind]))
+        x = np.zeros((len(key[0]), len(self.slots), KNOWN[self.kind][0]))
         x[..., :2] = size * draw(0, len(self.slots), 2)
-        if self.kind == "Unicycle":
+        if self.turns:
             x[..., 2] = np.pi * draw(1, len(self.slots))
         goal = np.repeat(size * draw(2, 2)[:, None], len(self.slots), axis=1)
         return x, goal, fold(key, zlib.crc32(b"perturb"))
@@ -101,20 +108,22 @@ class Replica:
 
     def step(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         dt, x = self.game["dt"], x.copy()
-        x[..., -2:] += dt * u  # the velocities; of a single integrator, the position itself
-        if self.kind == "Unicycle":
+        if self.kind == "LateUnicycle":
+            u, x[..., 5:] = x[..., 5:].copy(), u
+        x[..., KNOWN[self.kind][1]] += dt * u
+        if self.turns:
             x[..., 2] += dt * x[..., 4]
         x[..., :2] += dt * self.motion(x)[0]
         return x
 
     def heading(self, x: np.ndarray) -> np.ndarray:
-        if self.kind == "Unicycle":
+        if self.turns:
             return np.stack([np.cos(x[..., 2]), np.sin(x[..., 2])], axis=-1)
         return np.broadcast_to([1.0, 0.0], (*x.shape[:-1], 2))
 
     def motion(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Velocity of the position in the world, and what the agent feels of its motion."""
-        if self.kind == "Unicycle":
+        if self.turns:
             return x[..., 3:4] * self.heading(x), x[..., 3:]
         return (x[..., 2:], x[..., 2:]) if x.shape[-1] == 4 else (0 * x, x[..., :0])
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from marlyap.controllers import CONTROLLERS, OptimalControl, PointOffset, Replayed
-from marlyap.dynamics import DoubleIntegrator, Unicycle
+from marlyap.dynamics import DoubleIntegrator, LateUnicycle, Unicycle
 from marlyap.errors import UserError
 from marlyap.evaluation import evaluate
 from marlyap.rollout import rollout
@@ -103,6 +103,9 @@ def test_proximity_graphs_leave_a_lonely_agent_at_rest(name):
 def test_other_dynamics_are_refused_in_one_sentence(name):
     with pytest.raises(UserError, match="drives unicycles only"):
         CONTROLLERS[name](Rendezvous(dynamics=DoubleIntegrator()))
+    if name != "tree-pursuit":
+        with pytest.raises(UserError, match="drives unicycles only, not LateUnicycle"):
+            CONTROLLERS[name](Rendezvous(dynamics=LateUnicycle()))
 
 
 def test_the_tree_leads_to_the_nearest_leader():
@@ -120,6 +123,17 @@ def test_tree_pursuit_solves_the_standard_task():
     game = Rendezvous()
     last = distances(game, CONTROLLERS["tree-pursuit"](game), 500)[-1]
     assert (last <= game.radius).all(axis=1).mean() >= 0.99
+
+
+def test_tree_pursuit_looks_a_step_ahead_where_inputs_are_late():
+    """A leader alone knows all that will happen: it does the same one step later."""
+    soon = Rendezvous(agents=1)
+    late = Rendezvous(agents=1, dynamics=LateUnicycle())
+    on_time, delayed = (distances(g, CONTROLLERS["tree-pursuit"](g), 20) for g in (soon, late))
+    np.testing.assert_allclose(delayed[1:], on_time[:-1], atol=1e-3)
+    team = Rendezvous(dynamics=LateUnicycle())
+    last = distances(team, CONTROLLERS["tree-pursuit"](team), 500)[-1]
+    assert (last <= team.radius).all(axis=1).mean() >= 0.99
 
 
 def test_point_offset_brings_the_offset_points_to_the_goal():

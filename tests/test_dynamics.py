@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from marlyap.certificates.theorem1 import l_f
 from marlyap.constraints.lyapunov import Lyapunov
-from marlyap.dynamics import DYNAMICS, DoubleIntegrator, SingleIntegrator, Unicycle
+from marlyap.dynamics import DYNAMICS, DoubleIntegrator, LateUnicycle, SingleIntegrator, Unicycle
 from marlyap.errors import UserError
 
 
@@ -20,6 +21,7 @@ def unicycle(x, u):
 
 FIELDS = {
     "unicycle": unicycle,
+    "late-unicycle": lambda x, u: np.array([*unicycle(x[:5], x[5:]), 0, 0]),
     "double-integrator": lambda x, u: np.array([x[2], x[3], u[0], u[1]]),
     "single-integrator": lambda x, u: np.array(u),
 }
@@ -81,7 +83,7 @@ def test_order_of_convergence(integrator, order):
     assert errors[-1] < (0.2 if order == 1 else 1e-5)
 
 
-@every
+@pytest.mark.parametrize("name", set(FIELDS) - {"late-unicycle"})
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 def test_long_runs_follow_the_reference_in_single_precision(name, integrator):
     rng = np.random.default_rng(2)
@@ -116,6 +118,23 @@ def test_integrators_of_integrators_are_exact(integrator):
     v1 = v + dt * a
     x1 = x + dt * v1 if integrator == "euler" else x + dt * v + dt**2 / 2 * a
     np.testing.assert_allclose(two, [*x1, *v1], rtol=1e-14)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+def test_a_late_unicycle_does_one_step_later_what_a_unicycle_does(integrator):
+    rng, limits = np.random.default_rng(5), (2.0, 3.0)
+    x, late = jnp.array(start("unicycle", rng)), LateUnicycle(limits, integrator)
+    y = jnp.concatenate([x, jnp.zeros(2)])
+    before = Unicycle(limits, integrator).step(x, jnp.zeros(2), 0.1)
+    np.testing.assert_array_equal(late.due(y, 0.1)[:5], before)
+    actions = rng.uniform(-1.5, 1.5, (6, 2))
+    idle = jnp.zeros((1, 2))
+    soon = drive(Unicycle(limits, integrator), x, jnp.concatenate([idle, actions]), 0.1, 1)
+    then = drive(late, y, jnp.concatenate([actions, idle]), 0.1, 1)
+    np.testing.assert_allclose(then[:5], soon, rtol=1e-14)
+    np.testing.assert_array_equal(then[5:], 0)
+    asked = late.step(y, jnp.array(actions[0]), 0.1)[5:]
+    np.testing.assert_array_equal(asked, np.clip(actions[0], -1, 1) * limits)
 
 
 @every
@@ -187,6 +206,8 @@ def test_the_lipschitz_constant_in_the_action():
     for v in (0.0, 1.0, -3.0, 5.0):
         analytic = np.sqrt(dt**2 + dt**4 + dt**6 * v**2) * limit
         assert gain(v, 0.4) == pytest.approx(analytic, rel=1e-9)
+    # A late input moves nothing within its step but itself.
+    assert l_f(LateUnicycle(), dt, 3.0) == pytest.approx(1.0)
     # The default of the constraint bounds it for |v| <= 5 m/s, and not by far.
     assert gain(5.0, 0.0) <= Lyapunov().input_gain <= 1.01 * gain(5.0, 0.0)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from marlyap.conformance import LAWS, conformance, see
-from marlyap.dynamics import DoubleIntegrator, SingleIntegrator, Unicycle
+from marlyap.dynamics import DoubleIntegrator, LateUnicycle, SingleIntegrator, Unicycle
 from marlyap.errors import UserError
 from marlyap.rollout import Decentralised, Uniform, rollout
 from marlyap.sensing import near
@@ -25,6 +25,7 @@ VARIANTS = {
     "disk": Rendezvous(agents=4, graph="disk:0.9", headings=True),
     "edges": Rendezvous(agents=4, graph="0-2,2-1,2-3", dynamics=SingleIntegrator((2.0, 0.5))),
     "rk4": Rendezvous(agents=2, headings=True, dynamics=Unicycle((2.0, 3.0), "rk4")),
+    "late": Rendezvous(agents=2, graph="path", dynamics=LateUnicycle((2.0, 3.0))),
     "alone": Rendezvous(agents=1),
 }
 GAMES = VARIANTS | {f"TASKS[{k}]": g for k, g in TASKS.items() if g not in VARIANTS.values()}

@@ -23,7 +23,7 @@ from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness, moved
 from marlyap.certificates.theorem1 import Theorem1
 from marlyap.certify import certify, save
-from marlyap.dynamics import DoubleIntegrator, SingleIntegrator, Unicycle
+from marlyap.dynamics import DoubleIntegrator, LateUnicycle, SingleIntegrator, Unicycle
 from marlyap.errors import UserError
 from marlyap.identity import named_arrays, plain
 from marlyap.lyapunov_function import Norm, Quadratic
@@ -328,6 +328,7 @@ def test_a_certificate_without_one_of_its_arrays_is_rejected(bundle, tmp_path):
         (Unicycle(), "norm", {}),
         (DoubleIntegrator(), "quadratic", {"noise": 0.3, "gain": 0.5, "spread": 1.5}),
         (SingleIntegrator(), "norm", {"drop": 0.3, "delay": 2}),
+        (LateUnicycle(), "norm", {"noise": 0.2, "gain": 1.5, "delay": 1}),
         (Unicycle(), "norm", {"noise": 0.1, "cut": ((0, 1),), "drop": 0.5}),
     ],
 )

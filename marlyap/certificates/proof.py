@@ -168,7 +168,7 @@ class Loop:
 
     def __init__(self, game: Any, controller: Any):
         model = game.dynamics
-        known = isinstance(model, (Unicycle, DoubleIntegrator)) and model.integrator == "euler"
+        known = type(model) in (Unicycle, DoubleIntegrator) and model.integrator == "euler"
         pi = getattr(getattr(controller, "policy", None), "pi", None)
         if game.agents != 1 or not known or pi is None:
             raise UserError(

@@ -130,9 +130,10 @@ def l_f(dynamics: AbstractDynamics, dt: float, speed: float) -> float:
 
     One semi-implicit step of the unicycle has the orthogonal columns ds'/da = (dt^2 h, 0, dt, 0)
     and ds'/dr = (dt^3 v' n, dt^2, 0, dt), so that it is sqrt(dt^2 + dt^4 + dt^6 v'^2) exactly. For
-    the other dynamics, which are linear, the spectral norm of ds'/du. Of a team it is the largest.
+    the other dynamics, of which a step is linear in the input, the spectral norm of ds'/du. Of a
+    team it is the largest.
     """
-    if isinstance(dynamics, Unicycle) and dynamics.integrator == "euler":
+    if type(dynamics) is Unicycle and dynamics.integrator == "euler":
         return float(np.sqrt(dt**2 + dt**4 + dt**6 * speed**2))
     x = jnp.zeros(dynamics.dx)
     if isinstance(dynamics, Unicycle):

@@ -1,13 +1,14 @@
 """What the hand-written controllers share: their seam, and what one agent may know."""
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from marlyap.dynamics import Unicycle
+from marlyap.dynamics import AbstractDynamics, Unicycle
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.types import Action, Key, State
@@ -21,9 +22,10 @@ class AbstractController(eqx.Module):
     """
 
     game: eqx.AbstractVar[AbstractGame]
+    drives: ClassVar[tuple[type[AbstractDynamics], ...]] = (Unicycle,)
 
     def __check_init__(self):
-        if not isinstance(self.game.dynamics, Unicycle):
+        if type(self.game.dynamics) not in self.drives:
             raise UserError(
                 f"controller: {type(self).__name__} drives unicycles only, not "
                 f"{type(self.game.dynamics).__name__}; choose the dynamics unicycle."

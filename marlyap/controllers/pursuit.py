@@ -7,6 +7,7 @@ from jaxtyping import Array, Int
 from marlyap import graph as graphs
 from marlyap.controllers.cascade import Cascade
 from marlyap.controllers.controller import AbstractController, as_action, headings
+from marlyap.dynamics import LateUnicycle, Unicycle
 from marlyap.game import AbstractGame
 from marlyap.types import State
 
@@ -14,11 +15,15 @@ from marlyap.types import State
 class TreePursuit(AbstractController):
     """A leader drives to its goal, a follower to the predicted stop point of its parent.
 
+    Each starts from where it will be when its inputs act.
+
     The parent of i is the neighbour with the fewest hops to a leader (the lowest index among
     equals), so errors travel down a tree only. It will stop about `margin` v_j^2 / (2 a_max) ahead
     on its heading. An agent needs its neighbours' hop counts, one local message, and its parent's
     velocity. An agent that no path joins to a leader brakes.
     """
+
+    drives = (Unicycle, LateUnicycle)
 
     game: AbstractGame
     margin: float = 1.9  # predicted stopping distance over the shortest possible
@@ -26,12 +31,14 @@ class TreePursuit(AbstractController):
 
     def __call__(self, state, key):
         leads, parent = jnp.asarray(self.game.leads), self.parents(state)
-        p, v = self.game.positions(state), state.x[:, 3]
-        stop = self.margin * v * jnp.abs(v) / (2 * self.game.dynamics.limits[0])
-        ends = p + stop[:, None] * headings(self.game, state)
+        dynamics, v = self.game.dynamics, state.x[:, 3]
+        stop = self.margin * v * jnp.abs(v) / (2 * dynamics.limits[0])
+        ends = self.game.positions(state) + stop[:, None] * headings(self.game, state)
+        x = jax.vmap(lambda x: dynamics.due(x, self.game.dt))(state.x)
+        p = jax.vmap(dynamics.position)(x)
         follow = jnp.where((parent >= 0)[:, None], ends[parent], p)
         e = jnp.where(leads[:, None], state.goal, follow) - p
-        u = jax.vmap(self.cascade, in_axes=(None, 0, 0))(self.game, state.x, e)
+        u = jax.vmap(self.cascade, in_axes=(None, 0, 0))(self.game, x, e)
         return as_action(self.game, u)
 
     def parents(self, state: State) -> Int[Array, "agent"]:

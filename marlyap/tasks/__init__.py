@@ -1,6 +1,6 @@
 """The tasks that can be asked for by name: configured objects, so a name is a preset."""
 
-from marlyap.dynamics import Unicycle
+from marlyap.dynamics import LateUnicycle, Unicycle
 from marlyap.tasks.formation import Formation as Formation
 from marlyap.tasks.rendezvous import Rendezvous as Rendezvous
 
@@ -9,5 +9,6 @@ TASKS = {
     "rendezvous": Rendezvous(),
     "rendezvous-path5": Rendezvous(agents=5, graph="path"),
     "rendezvous-hard": Rendezvous(agents=5, graph="path", dynamics=Unicycle(limits=(2.0, 2.0))),
+    "rendezvous-late": Rendezvous(dynamics=LateUnicycle()),
     "formation": Formation(),
 }
