@@ -1,6 +1,8 @@
 """The interaction graph G = <I, E> of section 2.1: undirected, connected, written as text.
 
 complete | path | ring | star      named graphs on n agents
+geometric:0.3                      n points drawn once in a unit square, the same for every n, and
+                                   edges between those closer than 0.3
 disk:0.8                           neighbours are those closer than 0.8 m at this instant
 0-1,1-2,1-3                        any edge list
 complete/8                         any of these, of which an agent observes 8 neighbours: the first
@@ -15,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from marlyap.errors import UserError
+from marlyap.threefry import uniform
 
 
 NAMED = ("complete", "path", "ring", "star")
@@ -37,30 +40,25 @@ def adjacency(graph: str, n: int) -> Bool[np.ndarray, "agent agent"]:
         return (gap == 1) | ((gap == n - 1) & (gap > 0))
     if graph == "star":
         return (gap > 0) & ((i[:, None] == 0) | (i[None, :] == 0))
-    edges = _edges(graph, n)
-    linked = np.zeros((n, n), bool)
-    for a, b in edges:
-        linked[a, b] = linked[b, a] = True
+    linked, within = np.zeros((n, n), bool), _radius(graph, "geometric")
+    if within is None:
+        for a, b in _edges(graph, n):
+            linked[a, b] = linked[b, a] = True
+    else:
+        p = uniform((np.zeros(1, np.uint32), np.array([n], np.uint32)), n, 2)[0]
+        linked = (np.linalg.norm(p[:, None] - p[None, :], axis=-1) < within) & (gap > 0)
     apart = np.flatnonzero(hops(linked, (0,)) < 0)
     if apart.size:
         raise UserError(
             f"graph: '{graph}' is not connected (no path from agent 0 to agent {apart[0]}); "
-            "add an edge that joins them."
+            f"{'add an edge that joins them' if within is None else 'take a larger radius'}."
         )
     return linked
 
 
 def disk_radius(graph: str) -> float | None:
     """The radius R (m) of `disk:R`, None for every other graph."""
-    if not graph.startswith("disk:"):
-        return None
-    try:
-        radius = float(graph[5:].partition("/")[0])
-    except ValueError:
-        radius = -1.0
-    if not 0 < radius < np.inf:
-        raise UserError(f"graph: '{graph}' needs a positive radius in metres, as in disk:0.8.")
-    return radius
+    return _radius(graph, "disk")
 
 
 def room(graph: str) -> int | None:
@@ -102,12 +100,26 @@ def hops(
     return distance
 
 
+def _radius(graph: str, name: str) -> float | None:
+    """The number after `name:`, None where the graph is another one."""
+    start, colon, rest = graph.partition(":")
+    if start != name or not colon:
+        return None
+    try:
+        radius = float(rest.partition("/")[0])
+    except ValueError:
+        radius = -1.0
+    if not 0 < radius < np.inf:
+        raise UserError(f"graph: '{graph}' needs a positive radius in metres, as in {name}:0.8.")
+    return radius
+
+
 def _edges(graph: str, n: int) -> list[tuple[int, int]]:
     pairs = [re.fullmatch(r"\s*(\d{1,6})\s*-\s*(\d{1,6})\s*", e) for e in graph.split(",")]
     if not graph or any(p is None for p in pairs):
         raise UserError(
-            f"graph: '{graph}' is none of {', '.join(NAMED)}, disk:RADIUS "
-            "or an edge list such as 0-1,1-2."
+            f"graph: '{graph}' is none of {', '.join(NAMED)}, geometric:RADIUS, "
+            "disk:RADIUS or an edge list such as 0-1,1-2."
         )
     edges = [(int(p[1]), int(p[2])) for p in pairs if p]
     for a, b in edges:

@@ -22,8 +22,8 @@ FLOORS = """
     store
     identity
     programs
-    graph
     threefry
+    graph
     replica
     recheck
     dynamics

@@ -37,7 +37,7 @@ def test_graphs_by_hand(graph, n, want):
     assert not linked.diagonal().any()
 
 
-@pytest.mark.parametrize("graph", [*NAMED, "disk:1"])
+@pytest.mark.parametrize("graph", [*NAMED, "geometric:1.5", "disk:1"])
 @pytest.mark.parametrize("n", [1, 2, 3, 7])
 def test_named_graphs_are_connected(graph, n):
     linked = adjacency(graph, n)
@@ -49,7 +49,11 @@ def test_named_graphs_are_connected(graph, n):
 @pytest.mark.parametrize(
     ("graph", "n", "says"),
     [
-        ("tree", 3, r"^graph: 'tree' is none of complete, path, ring, star, disk:RADIUS"),
+        (
+            "tree",
+            3,
+            r"^graph: 'tree' is none of complete, path, ring, star, geometric:RADIUS, disk:RADIUS",
+        ),
         ("", 3, r"^graph: '' is none of"),
         ("0-1,", 3, r"^graph: '0-1,' is none of"),
         ("0-1;1-2", 3, r"^graph: .* is none of"),
@@ -64,6 +68,8 @@ def test_named_graphs_are_connected(graph, n):
         ("disk:0", 3, r"^graph: 'disk:0' needs a positive radius"),
         ("disk:-1", 3, r"^graph: 'disk:-1' needs a positive radius"),
         ("disk:nan", 3, r"^graph: 'disk:nan' needs a positive radius"),
+        ("geometric:-1", 3, r"^graph: 'geometric:-1' needs a positive radius .* geometric:0\.8"),
+        ("geometric:1e-6", 3, r"^graph: .*no path from agent 0 to agent 1\); take a larger radius"),
         ("disk:inf", 3, r"^graph: 'disk:inf' needs a positive radius"),
         ("9999999-0", 3, r"^graph: .* is none of"),
         ("path/0", 3, r"^graph: 'path/0' needs a whole number from 1 to 9999 after the /"),
@@ -75,6 +81,19 @@ def test_named_graphs_are_connected(graph, n):
 def test_bad_graphs_are_named(graph, n, says):
     with pytest.raises(UserError, match=says):
         adjacency(graph, n)
+
+
+def test_a_geometric_graph_is_that_of_points_in_a_square():
+    """As the radius grows edges are added, all of them at the diagonal; they grow as pi r^2 / 2."""
+    nested = [adjacency(f"geometric:{r}", 64) for r in (0.25, 0.4, 0.8, 1.5)]
+    for fewer, more in zip(nested, nested[1:], strict=False):
+        assert (fewer <= more).all() and fewer.sum() < more.sum()
+    assert edges(nested[-1]) == edges(adjacency("complete", 64))
+    assert not nested[0].diagonal().any() and (nested[0] == nested[0].T).all()
+    share = adjacency("geometric:0.1", 1000).sum() / (1000 * 999)
+    # of the disk round a point a border of the square cuts off 4/3 r^3 on average
+    assert share == pytest.approx(np.pi * 0.1**2 - 8 / 3 * 0.1**3 + 0.1**4 / 2, rel=0.05)
+    assert neighbours(nested[0], room("geometric:0.25/8")).shape == (64, 8)
 
 
 def test_disk_radius():

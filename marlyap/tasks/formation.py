@@ -20,7 +20,7 @@ class Formation(AbstractGame):
 
     agents: int = 3  # N
     leaders: tuple[int, ...] = (0, 1)  # the agents that see their place
-    graph: str = "complete"  # complete, path, ring, star, disk:RADIUS or edges such as 0-1,1-2
+    graph: str = "complete"  # complete, path, ring, star, geometric:R, disk:R or edges like 0-1,1-2
     spread: float = 0.5  # radius of the circle on which the places lie (m)
     radius: float = 0.1  # an agent has arrived when it is this close to its place (m)
     size: float = 1.0  # starts and centres are uniform in [-size, size]^2 (m)

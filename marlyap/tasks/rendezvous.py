@@ -18,7 +18,7 @@ class Rendezvous(AbstractGame):
 
     agents: int = 3  # N
     leaders: tuple[int, ...] = (0,)  # the agents that see the target
-    graph: str = "complete"  # complete, path, ring, star, disk:RADIUS or edges such as 0-1,1-2
+    graph: str = "complete"  # complete, path, ring, star, geometric:R, disk:R or edges like 0-1,1-2
     radius: float = 0.1  # an agent has arrived when it is this close (m)
     size: float = 1.0  # starts and targets are uniform in [-size, size]^2 (m)
     headings: bool = False  # whether neighbours' headings are seen
