@@ -39,6 +39,7 @@ from marlyap.evaluation import RADII, outcome, share
 from marlyap.fit import fit
 from marlyap.game import AbstractGame
 from marlyap.marl_eval import document
+from marlyap.report import PALETTE
 from marlyap.rollout import rollout
 from marlyap.run import Run
 from marlyap.seeds import stream
@@ -353,17 +354,21 @@ def improvements(args: argparse.Namespace, name: str, plain: str) -> None:
 
 
 def canvas(panels: int, width: float, height: float) -> tuple[Any, list[Any]]:
-    """A figure with several panels side by side."""
+    """A figure with several panels, at most four side by side."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width * panels + 1.5, height), layout="constrained")
-    grid = list(np.ravel(figure.subplots(1, panels, squeeze=False)))
-    for axes in grid:
+    across, down = min(panels, 4), -(-panels // 4)
+    figure = Figure(figsize=(width * across + 1.5, height * down), layout="constrained")
+    grid = list(np.ravel(figure.subplots(down, across, squeeze=False)))
+    for axes in grid[panels:]:
+        axes.set_axis_off()
+    for axes in grid[:panels]:
+        axes.set_prop_cycle(color=PALETTE)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="x", color="#ecebe6")
         axes.tick_params(labelsize=7)
         axes.title.set_fontsize(8)
-    return figure, grid
+    return figure, grid[:panels]
 
 
 def save(figure: Any, path: Path) -> None:

@@ -40,6 +40,7 @@ def curves(args, name):
     """The paper's two figures."""
     forest(args, name)
     points = defaultdict(list)
+    names = [*COMPARED, *OTHERS]  # each has its colour, whatever was run first
     for row in read(args, f"{name}-curves"):
         if row["success"]:
             points[row["algorithm"], row["seed"]].append(row)
@@ -50,7 +51,7 @@ def curves(args, name):
             "seed": int(seed),
             "log": [{k: float(r[k]) for k in ("steps", "success", "return")} for r in rows],
         }
-        for (algorithm, seed), rows in points.items()
+        for (algorithm, seed), rows in sorted(points.items(), key=lambda p: names.index(p[0][0]))
     ]
     draw.learning_curves_png(runs, args.results / f"{name}-curves.png")
 

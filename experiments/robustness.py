@@ -109,18 +109,20 @@ def curves(args):
         found[row["perturbation"]][row["algorithm"]][row["level"]].append(row)
     figure, panels = canvas(len(found), 2.2, 2.8)
     for axes, (kind, algorithms) in zip(panels, found.items(), strict=True):
-        for algorithm, levels in algorithms.items():
+        for place, (algorithm, levels) in enumerate(algorithms.items()):
             points = {level: estimate(rows) for level, rows in levels.items()}
             for level, e in points.items():
                 interval = f"{e.mean:.3f} [{e.low:.3f}, {e.high:.3f}]"
                 print(f"{kind} {level:<5} {algorithm:<16} {interval}, {len(e.seeds)} policies")
             beside(kind, algorithm, points, algorithms)
-            x = [float(level) if kind in KINDS else level for level in points]
+            x = [float(level) if kind in KINDS else place for level in points]
             (line,) = axes.plot(x, [e.mean for e in points.values()], ".-", label=algorithm)
             ends = [[e.low for e in points.values()], [e.high for e in points.values()]]
             axes.vlines(x, *ends, color=line.get_color(), alpha=0.5)
-        axes.set(ylim=(-0.03, 1.03), title=MEANING[kind])
-        axes.set_xticks(x)
+        one = "" if kind in KINDS else f" ({', '.join(levels)})"
+        axes.set(ylim=(-0.03, 1.03), title=MEANING[kind] + one)
+        axes.set_xticks(x if kind in KINDS else [])
+        axes.margins(x=0.05 if kind in KINDS else 0.2)
     panels[0].set_ylabel(f"success within {RADIUS} m", fontsize=8)
     panels[0].legend(frameon=False, fontsize=7)
     save(figure, args.results / f"robustness-{args.task}.png")
