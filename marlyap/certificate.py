@@ -8,7 +8,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -73,6 +73,7 @@ class AbstractCertificate(eqx.Module):
 
     confidence: eqx.AbstractVar[float]
     evidence: eqx.AbstractClassVar[Evidence]
+    asks_V: ClassVar[bool] = False  # whether V is part of what is claimed
 
     @abc.abstractmethod
     def check(

@@ -5,6 +5,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from marlyap import store
@@ -12,10 +15,11 @@ from marlyap.certificate import AbstractCertificate, Verdict
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.identity import named_arrays, plain, policy_hash, without_arrays, words
-from marlyap.lyapunov_function import AbstractLyapunov, CostSum, require_zero
-from marlyap.rollout import Controller
+from marlyap.lyapunov_function import AbstractLyapunov, CostSum, at_target, require_zero
+from marlyap.rollout import Controller, rollout
 from marlyap.seeds import stream
 from marlyap.statistics import bonferroni
+from marlyap.types import Key, Scalar
 
 
 KIND = "certificate"
@@ -37,11 +41,11 @@ def certify(
 
     Each sampled one is asked at 1 - (1 - confidence) / (claims * checkpoints) (Bonferroni), with
     `checkpoints` the number of controllers among which this one was or will be chosen by
-    certificates. V is by default the T-step cost sum outside a ball of half the radius. `policy`
-    is the hash that the controller was declared with, and `tell` hears of each verdict at once.
+    certificates. V is by default `cost_sum`. `policy` is the hash that the controller was declared
+    with, and `tell` hears of each verdict at once.
 
-    Raises UserError if V is not 0 on the target set, if there are too few rollouts for the
-    confidence asked for, or if the controller is not the one declared.
+    Raises UserError if V is asked about and not 0 on the target set, if there are too few rollouts
+    for the confidence asked for, or if the controller is not the one declared.
     """
     if not certificates:
         raise UserError("certificates: there must be at least one.")
@@ -51,8 +55,9 @@ def certify(
             f"policy: its hash is {digest[:12]}, not the declared {policy[:12]}; a certificate is "
             "for a policy that was fixed beforehand."
         )
-    V = CostSum(controller=controller, ball=game.radius / 2) if V is None else V
-    require_zero(game, V, stream(seed, "calibrate"))
+    V = cost_sum(game, controller, seed) if V is None else V
+    if any(c.asks_V for c in certificates.values()):
+        require_zero(game, V, stream(seed, "calibrate"))
     sampled = sum(c.evidence == "statistical" for c in certificates.values())
     each = bonferroni(confidence, max(1, sampled) * checkpoints)
     asked = {name: dataclasses.replace(c, confidence=each) for name, c in certificates.items()}
@@ -76,6 +81,30 @@ def certify(
     }
 
 
+def cost_sum(game: AbstractGame, controller: Controller, seed: int) -> CostSum:
+    """The T-step cost sum outside the smallest ball that the controller keeps from the target.
+
+    Learnt policies keep moving a little there: what counts is leaving the ball. Its radius is that
+    of the game, or two or four times that.
+    """
+    V = CostSum(controller=controller, ball=game.radius)
+    strays = float(furthest(game, controller, stream(seed, "calibrate"), V.T))
+    balls = [game.radius * 2**k for k in range(3)]
+    return dataclasses.replace(V, ball=next((b for b in balls if strays <= b), balls[0]))
+
+
+@eqx.filter_jit
+def furthest(game: AbstractGame, controller: Controller, key: Key, steps: int) -> Scalar:
+    """How far any agent gets from its goal within some steps from rest on it (m), in 64 scenes."""
+
+    def one(key: Key) -> Scalar:
+        start = at_target(game, game.reset(key))
+        seen = rollout(game, controller, start, jax.random.key(0), steps)
+        return jnp.max(jax.vmap(game.distance)(seen.state))
+
+    return jnp.max(jax.vmap(one)(jax.random.split(key, 64)))
+
+
 def save(
     directory: Path,
     result: Mapping[str, Any],
@@ -91,7 +120,7 @@ def save(
     """
     if policy_hash(controller) != result["policy"]:
         raise UserError("policy: this controller is not the one that was certified.")
-    V = CostSum(controller=controller, ball=game.radius / 2) if V is None else V
+    V = CostSum(controller=controller, ball=result["V"]["ball"]) if V is None else V
     arrays = {f"controller/{k}": v for k, v in named_arrays(controller).items()}
     arrays["controller/words"] = words(controller)
     arrays |= {f"V/{k}": v for k, v in named_arrays(V).items()}

@@ -20,13 +20,12 @@ from marlyap.algorithm import AbstractAlgorithm
 from marlyap.algorithms import ALGORITHMS, PRESETS
 from marlyap.certificate import Verdict
 from marlyap.certificates import CERTIFICATES
-from marlyap.certify import certify, save
+from marlyap.certify import certify, cost_sum, save
 from marlyap.conformance import conformance
 from marlyap.controllers import CONTROLLERS
 from marlyap.errors import UserError
 from marlyap.evaluation import Evaluation, compare, evaluate, pooled
 from marlyap.game import AbstractGame
-from marlyap.lyapunov_function import CostSum
 from marlyap.recheck import recheck
 from marlyap.report import Film, Page, html
 from marlyap.run import Run, expand
@@ -263,8 +262,9 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
         c = CERTIFICATES[name]
         several = args.rollouts is not None and "rollouts" in config.fields(c)
         chosen[name] = dataclasses.replace(c, rollouts=args.rollouts) if several else c  # pyright: ignore
-    # Learnt policies keep moving a little on the target: what counts is leaving the ball.
-    V = CostSum(controller=controller, ball=game.radius)
+    V = cost_sum(game, controller, args.seed)
+    if V.ball > game.radius:
+        say(f"V counts what lies beyond {V.ball:g} m: so far this strays from the target itself.")
 
     def tell(verdict: Verdict) -> None:
         mark = "holds" if verdict.holds else "does not hold"

@@ -195,5 +195,6 @@ def require_zero(game: AbstractGame, V: AbstractLyapunov, key: Array) -> None:
     if not worst <= 1e-5 * max(usual, 1e-12):
         raise UserError(
             f"V: {type(V).__name__} is {worst:.3g} on the target set, where it must be 0 (it is "
-            f"{usual:.3g} at a usual start); take another V, or one that is 0 in a ball."
+            f"{usual:.3g} at a usual start); take a V that is 0 there, or certificates "
+            "that do not ask for one, such as reach."
         )

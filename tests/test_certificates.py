@@ -22,7 +22,7 @@ from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness
 from marlyap.certificates.theorem1 import Theorem1, input_jacobian, l_f
-from marlyap.certify import certify, save
+from marlyap.certify import certify, cost_sum, save
 from marlyap.controllers.point_offset import PointOffset
 from marlyap.dynamics import AbstractDynamics, DoubleIntegrator, SingleIntegrator, Unicycle
 from marlyap.errors import UserError
@@ -196,12 +196,44 @@ def test_one_nan_in_a_thousand_starts_is_not_certified():
     assert holding(result) == set()
 
 
+class Straying(eqx.Module):
+    """Drive to a place beside the goal (m)."""
+
+    off: jax.Array
+
+    def __call__(self, state, key):
+        return 4.0 * (state.goal + jnp.array([[1.0, 0.0]]) * self.off - state.x)
+
+
+def test_a_ball_is_taken_that_the_controller_keeps():
+    ball = lambda off: cost_sum(POINT, Straying(jnp.asarray(off)), 0).ball
+    radius = POINT.radius
+    balls = [ball(off * radius) for off in (0.0, 0.9, 1.1, 3.9, 9.0)]
+    assert balls == [radius, radius, 2 * radius, 4 * radius, radius]
+    beside = Straying(jnp.asarray(1.1 * radius))
+    result = certified(POINT, beside)
+    assert result["V"]["ball"] == 2 * radius
+    assert "beyond 0.2 m" in result["verdicts"]["decrease"]["claim"]
+    assert not result["verdicts"]["reach"]["holds"]
+
+
+def test_only_claims_about_v_need_one():
+    """Of a controller that leaves the target all that does not speak of V can still be said."""
+    away = Straying(jnp.asarray(9 * POINT.radius))
+    spoken = {name for name, c in TABLE.items() if c.asks_V}
+    assert spoken == {"decrease", "basin", "quantiles"}
+    for name in spoken:
+        with pytest.raises(UserError, match="certificates that do not ask for one"):
+            certified(POINT, away, {name: TABLE[name]})
+    assert not certified(POINT, away, {"reach": TABLE["reach"]})["holds"]
+
+
 def test_bad_input_is_one_sentence():
     few = {"reach": Reach(rollouts=50, share=0.99)}
     with pytest.raises(UserError, match=r"at least \d+ are needed"):
         certified(POINT, Scripted(), few)
     with pytest.raises(UserError, match="on the target set"):
-        certified(POINT, Scripted(spin=jnp.asarray(1.0)), few, V=Shifted())
+        certified(POINT, Scripted(spin=jnp.asarray(1.0)), V=Shifted())
     with pytest.raises(UserError, match="fixed beforehand"):
         certified(POINT, Scripted(), few, policy="0" * 64)
     with pytest.raises(UserError, match="at least one"):

@@ -35,6 +35,7 @@ class Basin(AbstractCertificate):
     share: float = 0.98
     confidence: float = 0.999
     evidence: ClassVar[Evidence] = "statistical"
+    asks_V: ClassVar[bool] = True
 
     def check(self, game, controller, V, seed):
         steps, n = game.horizon + max(self.stay, V.beyond), self.rollouts

@@ -32,6 +32,7 @@ class Decrease(AbstractCertificate):
     share: float = 0.98
     confidence: float = 0.999
     evidence: ClassVar[Evidence] = "statistical"
+    asks_V: ClassVar[bool] = True
 
     def check(self, game, controller, V, seed):
         enough(self.rollouts, self.share, self.confidence)
@@ -42,8 +43,8 @@ class Decrease(AbstractCertificate):
         return Verdict(
             name="decrease",
             claim=f"from at least a share {bound:.4f} of the starts V falls by {self.beta:g} of "
-            f"the cost in every step until the ball of {game.radius:g} m is entered, which "
-            f"happens within {H * game.dt:g} s",
+            f"the mean distance beyond {V.ball:g} m in every step until the ball of "
+            f"{game.radius:g} m is entered, which happens within {H * game.dt:g} s",
             **fields,
             holds=holds,
             figures={

@@ -50,6 +50,7 @@ class Proof(AbstractCertificate):
     show: bool = False  # a progress bar
     confidence: float = 1.0
     evidence: ClassVar[Evidence] = "proved"
+    asks_V: ClassVar[bool] = True
 
     def check(self, game, controller, V, seed):
         loop, V_of = Loop(game, controller), lyapunov(V, game.radius)

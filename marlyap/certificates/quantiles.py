@@ -38,6 +38,7 @@ class Quantiles(AbstractCertificate):
     q: float = 0.95
     confidence: float = 0.999
     evidence: ClassVar[Evidence] = "statistical"
+    asks_V: ClassVar[bool] = True
 
     def check(self, game, controller, V, seed):
         each = bonferroni(self.confidence, len(NAMES))

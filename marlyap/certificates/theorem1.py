@@ -51,6 +51,7 @@ class Theorem1(AbstractCertificate):
     share: float = 0.98
     confidence: float = 0.999
     evidence: ClassVar[Evidence] = "statistical"
+    asks_V: ClassVar[bool] = True
 
     def check(self, game, controller, V, seed):
         enough(self.rollouts, self.share, self.confidence)
