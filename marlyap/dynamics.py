@@ -75,8 +75,12 @@ class AbstractDynamics(eqx.Module):
         self, x: Float[Array, "dx"], action: Float[Array, "du"], dt: float
     ) -> Float[Array, "dx"]:
         """x_{t+1}: one step of `dt` seconds under a constant action in [-1, 1]^du."""
-        u = jnp.clip(action, -1.0, 1.0) * jnp.asarray(self.limits)
+        u = self.asked(action)
         return (semi_implicit_euler if self.integrator == "euler" else rk4)(self, x, u, dt)
+
+    def asked(self, action: Float[Array, "du"]) -> Float[Array, "du"]:
+        """The inputs, in physical units, that an action in [-1, 1]^du asks for."""
+        return jnp.clip(action, -1.0, 1.0) * jnp.asarray(self.limits)
 
     def due(self, x: Float[Array, "dx"], dt: float) -> Float[Array, "dx"]:
         """The state in which an input asked for now begins to act: x, where none is late."""
@@ -147,8 +151,7 @@ class LateUnicycle(Unicycle):
         return jnp.concatenate([super().field(x[:5], x[5:]), jnp.zeros(2)])
 
     def step(self, x, action, dt):
-        asked = jnp.clip(action, -1.0, 1.0) * jnp.asarray(self.limits)
-        return super().step(x, action, dt).at[5:].set(asked)
+        return super().step(x, action, dt).at[5:].set(self.asked(action))
 
     def due(self, x, dt):
         return self.step(x, jnp.zeros(2), dt)
