@@ -5,9 +5,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from marlyap import store
@@ -15,11 +12,10 @@ from marlyap.certificate import AbstractCertificate, Verdict
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.identity import named_arrays, plain, policy_hash, without_arrays, words
-from marlyap.lyapunov_function import AbstractLyapunov, CostSum, at_target, require_zero
-from marlyap.rollout import Controller, rollout
+from marlyap.lyapunov_function import AbstractLyapunov, CostSum, cost_sum, require_zero
+from marlyap.rollout import Controller
 from marlyap.seeds import stream
 from marlyap.statistics import bonferroni
-from marlyap.types import Key, Scalar
 
 
 KIND = "certificate"
@@ -55,9 +51,10 @@ def certify(
             f"policy: its hash is {digest[:12]}, not the declared {policy[:12]}; a certificate is "
             "for a policy that was fixed beforehand."
         )
-    V = cost_sum(game, controller, seed) if V is None else V
+    key = stream(seed, "calibrate")
+    V = cost_sum(game, controller, key) if V is None else V
     if any(c.asks_V for c in certificates.values()):
-        require_zero(game, V, stream(seed, "calibrate"))
+        require_zero(game, V, key)
     sampled = sum(c.evidence == "statistical" for c in certificates.values())
     each = bonferroni(confidence, max(1, sampled) * checkpoints)
     asked = {name: dataclasses.replace(c, confidence=each) for name, c in certificates.items()}
@@ -79,30 +76,6 @@ def certify(
         "certificates": {name: plain(c) for name, c in asked.items()},
         "verdicts": {name: verdict.as_dict() for name, verdict in verdicts.items()},
     }
-
-
-def cost_sum(game: AbstractGame, controller: Controller, seed: int) -> CostSum:
-    """The T-step cost sum outside the smallest ball that the controller keeps from the target.
-
-    Learnt policies keep moving a little there: what counts is leaving the ball. Its radius is that
-    of the game, or two or four times that.
-    """
-    V = CostSum(controller=controller, ball=game.radius)
-    strays = float(furthest(game, controller, stream(seed, "calibrate"), V.T))
-    balls = [game.radius * 2**k for k in range(3)]
-    return dataclasses.replace(V, ball=next((b for b in balls if strays <= b), balls[0]))
-
-
-@eqx.filter_jit
-def furthest(game: AbstractGame, controller: Controller, key: Key, steps: int) -> Scalar:
-    """How far any agent gets from its goal within some steps from rest on it (m), in 64 scenes."""
-
-    def one(key: Key) -> Scalar:
-        start = at_target(game, game.reset(key))
-        seen = rollout(game, controller, start, jax.random.key(0), steps)
-        return jnp.max(jax.vmap(game.distance)(seen.state))
-
-    return jnp.max(jax.vmap(one)(jax.random.split(key, 64)))
 
 
 def save(

@@ -20,15 +20,17 @@ from marlyap.algorithm import AbstractAlgorithm
 from marlyap.algorithms import ALGORITHMS, PRESETS
 from marlyap.certificate import Verdict
 from marlyap.certificates import CERTIFICATES
-from marlyap.certify import certify, cost_sum, save
+from marlyap.certify import certify, save
 from marlyap.conformance import conformance
 from marlyap.controllers import CONTROLLERS
 from marlyap.errors import UserError
 from marlyap.evaluation import Evaluation, compare, evaluate, pooled
 from marlyap.game import AbstractGame
+from marlyap.lyapunov_function import cost_sum
 from marlyap.recheck import recheck
 from marlyap.report import Film, Page, html
 from marlyap.run import Run, expand
+from marlyap.seeds import stream
 from marlyap.tasks import TASKS
 from marlyap.trainer import Trainer, schedule_for
 from marlyap.workers import train_all
@@ -262,7 +264,7 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
         c = CERTIFICATES[name]
         several = args.rollouts is not None and "rollouts" in config.fields(c)
         chosen[name] = dataclasses.replace(c, rollouts=args.rollouts) if several else c  # pyright: ignore
-    V = cost_sum(game, controller, args.seed)
+    V = cost_sum(game, controller, stream(args.seed, "calibrate"))
     if V.ball > game.radius:
         say(f"V counts what lies beyond {V.ball:g} m: so far this strays from the target itself.")
 

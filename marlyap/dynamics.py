@@ -75,15 +75,18 @@ class AbstractDynamics(eqx.Module):
         self, x: Float[Array, "dx"], action: Float[Array, "du"], dt: float
     ) -> Float[Array, "dx"]:
         """x_{t+1}: one step of `dt` seconds under a constant action in [-1, 1]^du."""
-        u = self.asked(action)
+        u = self.inputs_of(action)
         return (semi_implicit_euler if self.integrator == "euler" else rk4)(self, x, u, dt)
 
-    def asked(self, action: Float[Array, "du"]) -> Float[Array, "du"]:
+    def inputs_of(self, action: Float[Array, "du"]) -> Float[Array, "du"]:
         """The inputs, in physical units, that an action in [-1, 1]^du asks for."""
         return jnp.clip(action, -1.0, 1.0) * jnp.asarray(self.limits)
 
-    def due(self, x: Float[Array, "dx"], dt: float) -> Float[Array, "dx"]:
-        """The state in which an input asked for now begins to act: x, where none is late."""
+    def predict(self, x: Float[Array, "dx"], dt: float) -> Float[Array, "dx"]:
+        """The state in which an input asked for now begins to act: x, where none is late.
+
+        A law fed with it instead of x is a Smith predictor without model error.
+        """
         return x
 
 
@@ -142,7 +145,8 @@ class LateUnicycle(Unicycle):
     """A unicycle whose inputs act one step after they were asked for.
 
     Those under way, a (m/s^2) and r (rad/s^2), are part of its state, and it feels them: without
-    them the next state would not follow from what is known.
+    them the next state would not follow from what is known. The usual augmented state of a sampled
+    system with a delay (Astrom and Wittenmark, Computer-Controlled Systems, 1997).
     """
 
     names: ClassVar[tuple[str, ...]] = (*Unicycle.names, "a", "r")
@@ -151,9 +155,9 @@ class LateUnicycle(Unicycle):
         return jnp.concatenate([super().field(x[:5], x[5:]), jnp.zeros(2)])
 
     def step(self, x, action, dt):
-        return super().step(x, action, dt).at[5:].set(self.asked(action))
+        return super().step(x, action, dt).at[5:].set(self.inputs_of(action))
 
-    def due(self, x, dt):
+    def predict(self, x, dt):
         return self.step(x, jnp.zeros(2), dt)
 
 

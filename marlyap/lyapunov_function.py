@@ -198,3 +198,27 @@ def require_zero(game: AbstractGame, V: AbstractLyapunov, key: Array) -> None:
             f"{usual:.3g} at a usual start); take a V that is 0 there, or certificates "
             "that do not ask for one, such as reach."
         )
+
+
+def cost_sum(game: AbstractGame, controller: Controller, key: Array) -> CostSum:
+    """The T-step cost sum outside the smallest ball that the controller keeps from the target.
+
+    Learnt policies keep moving a little there: what counts is leaving the ball. Its radius (m) is
+    that of the game, or two or four times that; for a controller that strays further the first.
+    """
+    V = CostSum(controller=controller, ball=game.radius)
+    strays = float(_furthest(V, game, jax.random.split(key, 64)))
+    balls = [game.radius * 2**k for k in range(3)]
+    return eqx.tree_at(lambda v: v.ball, V, next((b for b in balls if strays <= b), balls[0]))
+
+
+@eqx.filter_jit
+def _furthest(V: CostSum, game: AbstractGame, keys: Array) -> Scalar:
+    """How far any agent gets from its goal within T steps from rest on it (m)."""
+
+    def one(key: Array) -> Scalar:
+        start = at_target(game, game.reset(key))
+        seen = rollout(game, V.controller, start, jax.random.key(0), V.T)
+        return jnp.max(jax.vmap(game.distance)(seen.state))
+
+    return jnp.max(jax.vmap(one)(keys))

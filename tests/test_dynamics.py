@@ -126,7 +126,7 @@ def test_a_late_unicycle_does_one_step_later_what_a_unicycle_does(integrator):
     x, late = jnp.array(start("unicycle", rng)), LateUnicycle(limits, integrator)
     y = jnp.concatenate([x, jnp.zeros(2)])
     before = Unicycle(limits, integrator).step(x, jnp.zeros(2), 0.1)
-    np.testing.assert_array_equal(late.due(y, 0.1)[:5], before)
+    np.testing.assert_array_equal(late.predict(y, 0.1)[:5], before)
     actions = rng.uniform(-1.5, 1.5, (6, 2))
     idle = jnp.zeros((1, 2))
     soon = drive(Unicycle(limits, integrator), x, jnp.concatenate([idle, actions]), 0.1, 1)

@@ -84,14 +84,14 @@ def test_bad_graphs_are_named(graph, n, says):
 
 
 def test_a_geometric_graph_is_that_of_points_in_a_square():
-    """As the radius grows edges are added, all of them at the diagonal; they grow as pi r^2 / 2."""
+    """A larger radius only adds edges, beyond the diagonal there are all; their share is known."""
     nested = [adjacency(f"geometric:{r}", 64) for r in (0.25, 0.4, 0.8, 1.5)]
     for fewer, more in zip(nested, nested[1:], strict=False):
         assert (fewer <= more).all() and fewer.sum() < more.sum()
     assert edges(nested[-1]) == edges(adjacency("complete", 64))
     assert not nested[0].diagonal().any() and (nested[0] == nested[0].T).all()
     share = adjacency("geometric:0.1", 1000).sum() / (1000 * 999)
-    # of the disk round a point a border of the square cuts off 4/3 r^3 on average
+    # The distribution of the distance of two points in a unit square, up to 1.
     assert share == pytest.approx(np.pi * 0.1**2 - 8 / 3 * 0.1**3 + 0.1**4 / 2, rel=0.05)
     assert neighbours(nested[0], room("geometric:0.25/8")).shape == (64, 8)
 

@@ -34,7 +34,7 @@ class TreePursuit(AbstractController):
         dynamics, v = self.game.dynamics, state.x[:, 3]
         stop = self.margin * v * jnp.abs(v) / (2 * dynamics.limits[0])
         ends = self.game.positions(state) + stop[:, None] * headings(self.game, state)
-        x = jax.vmap(lambda x: dynamics.due(x, self.game.dt))(state.x)
+        x = jax.vmap(lambda x: dynamics.predict(x, self.game.dt))(state.x)
         p = jax.vmap(dynamics.position)(x)
         follow = jnp.where((parent >= 0)[:, None], ends[parent], p)
         e = jnp.where(leads[:, None], state.goal, follow) - p
