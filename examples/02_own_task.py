@@ -29,8 +29,8 @@ class Corner(AbstractGame):
         corner = self.size * jax.random.rademacher(k_corner, (2,), jnp.float32)
         return State(x=start.x, goal=jnp.tile(corner, (self.agents, 1)), t=start.t)
 
-    def observe(self, state):
-        return self.local_view(state)
+    def observe(self, state, links):
+        return self.local_view(state, links)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,6 @@ import numpy as np
 
 from marlyap import statistics
 from marlyap.algorithm import AbstractAlgorithm
-from marlyap.certificate import until
 from marlyap.certificates.contraction import Contraction
 from marlyap.config import fields
 from marlyap.errors import UserError
@@ -40,7 +39,7 @@ from marlyap.fit import fit
 from marlyap.game import AbstractGame
 from marlyap.marl_eval import document
 from marlyap.report import PALETTE
-from marlyap.rollout import rollout
+from marlyap.rollout import rollout, until
 from marlyap.run import Run
 from marlyap.seeds import stream
 from marlyap.store import write_text_atomic

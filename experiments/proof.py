@@ -86,7 +86,7 @@ def imitate(V, gains, c, width, seed, steps=2000):
 
     def loss(actors, key):
         x = draw(V, c, key, 2048)
-        wrong = lambda x: actors.mode(GAME.observe(seen(x)))[0] - law(V, gains, x)
+        wrong = lambda x: actors.mode(GAME.observations(seen(x)))[0] - law(V, gains, x)
         return jnp.mean(jax.vmap(wrong)(x) ** 2)
 
     @eqx.filter_jit

@@ -14,13 +14,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool
 
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.identity import plain
 from marlyap.lyapunov_function import AbstractLyapunov
-from marlyap.rollout import Controller, rollout
+from marlyap.rollout import Controller, finite, rollout, until
 from marlyap.seeds import Purpose, stream
 from marlyap.statistics import lower_bound, trials_needed
 from marlyap.types import Key, Scalar, State, Trajectory
@@ -142,19 +142,6 @@ def judged(
         parts.append(jax.tree.map(np.asarray, found))
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *map(vars, parts))
     return Found(**joined)
-
-
-def until(trajectory: Trajectory, steps: int) -> Trajectory:
-    """The rollout as if it had stopped after `steps` steps."""
-    cut = lambda tree, end: jax.tree.map(lambda leaf: leaf[:end], tree)
-    parts = {k: cut(v, steps) for k, v in vars(trajectory).items() if k != "state"}
-    return Trajectory(state=cut(trajectory.state, steps + 1), **parts)
-
-
-def finite(tree: PyTree) -> Bool[Array, ""]:
-    """Whether every number in the tree is finite."""
-    numbers = [x for x in jax.tree.leaves(tree) if eqx.is_inexact_array(x)]
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in numbers]))
 
 
 def start_of(game: AbstractGame, seed: int, purpose: Purpose, episode: int) -> State:

@@ -86,7 +86,7 @@ METHODS = {"obs": "observe", "next": "step"}  # the others are called as their k
 def see(game: AbstractGame, state: State, action: Action) -> dict[str, Any]:
     """Everything a game says of one state and action."""
     return {
-        "obs": game.observe(state),
+        "obs": game.observations(state),
         "features": game.features(state),
         "errors": game.errors(state),
         "costs": game.costs(state, action),
@@ -94,6 +94,7 @@ def see(game: AbstractGame, state: State, action: Action) -> dict[str, Any]:
         "rewards": game.rewards(state, action),
         "distance": game.distance(state),
         "success": game.success(state),
+        "violations": game.violations(state),
         "terminated": game.terminated(state),
         "linked": game.linked(state),
         "next": game.step(state, action),
@@ -237,8 +238,10 @@ def shapes(game: AbstractGame) -> Faults:
     if wrong:
         return
     action = jax.ShapeDtypeStruct((n, d.du), jnp.float32)
+    links = jax.ShapeDtypeStruct((n, n), jnp.bool_)
     for name, arguments, shape, kind in (
-        ("observe", (state,), (n, None), "floating"),
+        ("linked", (state,), (n, n), "bool"),
+        ("observe", (state, links), (n, None), "floating"),
         ("errors", (state,), (n, None), "floating"),
         ("features", (state,), (n, None), "floating"),
         ("distance", (state,), (n,), "floating"),
@@ -247,6 +250,7 @@ def shapes(game: AbstractGame) -> Faults:
         ("rewards", (state, action), (n,), "floating"),
         ("terminated", (state,), (), "bool"),
         ("success", (state,), (), "bool"),
+        ("violations", (state,), (n,), "bool"),
     ):
         try:
             yield from _unlike(

@@ -66,6 +66,10 @@ class AbstractDynamics(eqx.Module):
     def rates(self, x: Float[Array, "dx"]) -> Float[Array, "rate"]:
         """What the agent feels of its own motion; all zero exactly when it is at rest."""
 
+    def turning(self, x: Float[Array, "dx"]) -> Float[Array, ""]:
+        """How fast the agent turns (rad/s); 0 for one without a heading."""
+        return jnp.zeros(())
+
     def rest(self, position: Position, angle: Float[Array, ""]) -> Float[Array, "dx"]:
         """The state at rest at `position`, heading `angle` (radians) where there is a heading."""
         x = jnp.zeros(self.dx).at[jnp.array([0, 1])].set(position)
@@ -139,6 +143,9 @@ class Unicycle(AbstractDynamics):
 
     def rates(self, x):
         return x[3:]
+
+    def turning(self, x):
+        return x[4]
 
 
 class LateUnicycle(Unicycle):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
-from marlyap.rollout import AbstractPlanner, Controller, rollout
+from marlyap.rollout import AbstractPlanner, Controller, finite, rollout, until
 from marlyap.seeds import Purpose, stream
 from marlyap.statistics import clopper_pearson, mcnemar
 from marlyap.types import Key, Keys, Scalar, State, Trajectory
@@ -19,45 +19,58 @@ from marlyap.types import Key, Keys, Scalar, State, Trajectory
 
 RADII = (0.05, 0.1, 0.15, 0.2, 0.3)  # m, for the success curve
 HELD = 5  # steps over which `held` looks back
+REST = 0.1  # m/s and rad/s: an agent that moves and turns no faster is at rest
+BEYOND = 9  # horizons after the first over which an evaluation looks whether a team stays
 
 
 class Outcome(eqx.Module):
-    """What is kept of one episode; a failure to stay finite shows as NaN and counts as failed."""
+    """What is kept of one episode. One in which any number is not finite has failed."""
 
-    final: Scalar  # the worst agent's distance at the last step (m)
-    held: Scalar  # the worst distance over the last five steps (m)
-    speed: Scalar  # the fastest agent's speed at the last step (m/s)
-    settled: Scalar  # the time from which all stay within the radius (s); inf if they do not
-    total: Scalar  # return: the undiscounted sum of the team's rewards
+    success: Bool[Array, ""]  # `game.success` at the horizon
+    final: Scalar  # the worst agent's distance at the horizon (m); NaN where that is not finite
+    held: Bool[Array, ""]  # success in each of the last five steps
+    stayed: Bool[Array, ""]  # success from the horizon to the end of the rollout, in every step
+    speed: Scalar  # the fastest agent's speed at the horizon (m/s)
+    spin: Scalar  # the fastest agent's rate of turn at the horizon (rad/s)
+    settled: Scalar  # the time from which success lasts until the horizon (s); inf if it does not
+    violated: Bool[Array, ""]  # an agent broke a rule at some step until the horizon
+    total: Scalar  # return until the horizon: the undiscounted sum of the team's rewards
 
 
 def outcome(game: AbstractGame, trajectory: Trajectory) -> Outcome:
-    """Judge one episode."""
-    distance = jnp.max(jax.vmap(game.distance)(trajectory.state), axis=1)
-    last = jax.tree.map(lambda x: x[-1], trajectory.state)
-    speed = jnp.linalg.norm(jax.vmap(game.dynamics.velocity)(last.x), axis=1)
-    inside = distance <= game.radius
-    stays = jnp.cumprod(inside[::-1])[::-1].astype(bool)
-    first = jnp.argmax(stays) * game.dt
+    """Judge one episode of at least `game.horizon` steps; what lies beyond shows if it stays."""
+    seen = until(trajectory, game.horizon)
+    last = jax.tree.map(lambda x: x[-1], seen.state)
+    success = jax.vmap(game.success)(trajectory.state)
+    inside = success[: game.horizon + 1]
+    lasts = jnp.cumprod(inside[::-1])[::-1].astype(bool)
+    sound = finite(seen)
     return Outcome(
-        final=distance[-1],
-        held=jnp.max(distance[-HELD:]),
-        speed=jnp.max(speed),
-        settled=jnp.where(stays[-1], first, jnp.inf),
-        total=jnp.sum(jnp.mean(trajectory.reward, axis=1)),
+        success=inside[-1] & sound,
+        final=jnp.where(sound, jnp.max(game.distance(last)), jnp.nan),
+        held=jnp.all(inside[-HELD:]) & sound,
+        stayed=jnp.all(success[game.horizon :]) & finite(trajectory),
+        speed=jnp.max(jnp.linalg.norm(jax.vmap(game.dynamics.velocity)(last.x), axis=1)),
+        spin=jnp.max(jnp.abs(jax.vmap(game.dynamics.turning)(last.x))),
+        settled=jnp.where(lasts[-1] & sound, jnp.argmax(lasts) * game.dt, jnp.inf),
+        violated=jnp.any(jax.vmap(game.violations)(seen.state)),
+        total=jnp.sum(jnp.mean(seen.reward, axis=1)),
     )
 
 
-def episode(game: AbstractGame, controller: Controller, key: Key) -> Trajectory:
-    """One episode from the start that `key` draws; controllers with the same key share it."""
+def episode(game: AbstractGame, controller: Controller, key: Key, beyond: int = 0) -> Trajectory:
+    """One episode from the start that `key` draws, and `beyond` steps more.
+
+    Controllers with the same key share the start.
+    """
     k_start, k_act = jax.random.split(key)
-    return rollout(game, controller, game.reset(k_start), k_act)
+    return rollout(game, controller, game.reset(k_start), k_act, game.horizon + beyond)
 
 
 @eqx.filter_jit
-def outcomes(game: AbstractGame, controller: Controller, keys: Keys) -> Outcome:
+def outcomes(game: AbstractGame, controller: Controller, keys: Keys, beyond: int = 0) -> Outcome:
     """One outcome for every key."""
-    return jax.vmap(lambda k: outcome(game, episode(game, controller, k)))(keys)
+    return jax.vmap(lambda k: outcome(game, episode(game, controller, k, beyond)))(keys)
 
 
 @eqx.filter_jit
@@ -75,33 +88,52 @@ def starts(game: AbstractGame, keys: Keys) -> State:
 class Evaluation(eqx.Module):
     """The outcomes of many episodes of one controller, as NumPy arrays of length `episodes`."""
 
-    final: Float[np.ndarray, "episode"]
-    held: Float[np.ndarray, "episode"]
-    speed: Float[np.ndarray, "episode"]
-    settled: Float[np.ndarray, "episode"]
-    total: Float[np.ndarray, "episode"]
-    radius: float
-
-    @property
-    def successes(self) -> Bool[np.ndarray, "episode"]:
-        return self.final <= self.radius
+    successes: Bool[np.ndarray, "episode"]  # at the horizon
+    final: Float[np.ndarray, "episode"]  # worst distance at the horizon (m)
+    held: Bool[np.ndarray, "episode"]  # success in the last five steps
+    stayed: Bool[np.ndarray, "episode"]  # success from the horizon until `beyond` steps after it
+    speed: Float[np.ndarray, "episode"]  # largest at the horizon (m/s)
+    spin: Float[np.ndarray, "episode"]  # largest rate of turn at the horizon (rad/s)
+    settled: Float[np.ndarray, "episode"]  # s; inf where it does not
+    violated: Bool[np.ndarray, "episode"]  # a rule was broken until the horizon
+    total: Float[np.ndarray, "episode"]  # return
+    radius: float  # m
+    beyond: int  # steps after the horizon over which `stayed` looks
 
     @property
     def success_rate(self) -> float:
         return float(np.mean(self.successes))
 
+    @property
+    def at_rest(self) -> Bool[np.ndarray, "episode"]:
+        """Successes at whose horizon no agent moves or turns faster than `REST`."""
+        return self.successes & (self.speed <= REST) & (self.spin <= REST)
+
     def summary(self, confidence: float = 0.95) -> dict[str, Any]:
-        """Plain numbers: rates with exact intervals, distances (m), times (s)."""
+        """Plain numbers: rates with exact intervals, distances (m), times (s), speeds."""
         within = [{"radius": r} | share(self.final <= r, confidence) for r in RADII]
-        still = self.successes & (self.speed <= 0.1)
         return (
             share(self.successes, confidence)
             | {"confidence": confidence, "radius": self.radius, "radii": within}
-            | {"held": share(self.held <= self.radius, confidence)}
-            | {"at_rest": share(still, confidence)}
+            | {"held": share(self.held, confidence)}
+            | {"at_rest": share(self.at_rest, confidence)}
+            | {"stayed": share(self.stayed, confidence), "beyond_steps": self.beyond}
+            | {"violations": share(self.violated, confidence)}
             | {"final_distance": quantiles(self.final), "settling_time": quantiles(self.settled)}
-            | {"return_mean": float(np.mean(self.total))}
+            | {"final_speed": quantiles(self.speed), "final_spin": quantiles(self.spin)}
+            | {"return_mean": float(np.mean(self.total)), "rests": self.rests()}
         )
+
+    def rests(self) -> str:
+        """What the agents do once they have arrived, in words; empty where nobody arrives."""
+        moving = self.successes & ~self.at_rest
+        if not self.successes.any():
+            return ""
+        if np.mean(moving[self.successes]) < 0.5:
+            return "comes to rest"
+        speed, spin = np.median(self.speed[moving]), np.median(self.spin[moving])
+        what = "circles inside the ball" if spin > REST else "keeps moving inside the ball"
+        return f"{what} (median {speed:.2g} m/s, {spin:.2g} rad/s)"
 
 
 def evaluate(
@@ -110,26 +142,54 @@ def evaluate(
     episodes: int = 500,
     seed: int = 0,
     purpose: Purpose = "evaluate",
+    beyond: int | None = None,
 ) -> Evaluation:
-    """Drive the game from `episodes` fresh starts; the same seed gives the same starts.
+    """Drive the game from `episodes` held-out starts; the same seed gives the same starts.
 
-    Raises UserError if `episodes` is not positive.
+    `beyond` is for how many steps after the horizon it is watched whether the team stays; the
+    default is nine horizons, and 0 for a planner, whose plan ends at the horizon.
+
+    Raises UserError if `episodes` or `beyond` is out of range, or the controller does not return
+    one action for each agent.
     """
     if not 1 <= episodes <= 10_000_000:
         raise UserError(f"episodes: {episodes} is out of range; take 1 to 10000000.")
     keys = jax.random.split(stream(seed, purpose), episodes)
     if isinstance(controller, AbstractPlanner):
+        beyond = 0
         out = _outcomes_of_each(game, controller.plan(starts(game, keys)), keys)
     else:
-        out = outcomes(game, controller, keys)
-    return Evaluation(**{k: np.asarray(v) for k, v in vars(out).items()}, radius=game.radius)
+        drives(game, controller)
+        beyond = BEYOND * game.horizon if beyond is None else beyond
+        if not 0 <= beyond <= 1_000_000:
+            raise UserError(f"beyond: {beyond} steps is out of range; take 0 to 1000000.")
+        out = outcomes(game, controller, keys, beyond)
+    found = {k: np.asarray(v) for k, v in vars(out).items() if k != "success"}
+    return Evaluation(np.asarray(out.success), **found, radius=game.radius, beyond=beyond)
+
+
+def drives(game: AbstractGame, controller: Controller) -> None:
+    """Raise UserError unless the controller returns an action [agents, inputs] for this game."""
+    act = lambda key: controller(game.reset(key), key)
+    shape = jax.numpy.shape(eqx.filter_eval_shape(act, jax.random.key(0)))
+    wanted = game.agents, game.dynamics.du
+    if shape != wanted:
+        raise UserError(
+            f"controller: it returns an action of shape {list(shape)}, and {type(game).__name__} "
+            f"needs {list(wanted)}, one row for each agent."
+        )
 
 
 def pooled(evaluations: Sequence[Evaluation]) -> Evaluation:
-    """The outcomes of several controllers taken together."""
+    """The outcomes of several controllers in one game taken together.
+
+    Its intervals are about these very controllers. About the algorithm that trained them, or
+    another training seed, they say nothing.
+    """
+    names = [n for n in vars(evaluations[0]) if n not in ("radius", "beyond")]
     stack = lambda name: np.concatenate([getattr(e, name) for e in evaluations])
-    names = ("final", "held", "speed", "settled", "total")
-    return Evaluation(**{n: stack(n) for n in names}, radius=evaluations[0].radius)
+    first = evaluations[0]
+    return Evaluation(**{n: stack(n) for n in names}, radius=first.radius, beyond=first.beyond)
 
 
 def compare(a: Evaluation, b: Evaluation) -> dict[str, Any]:

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from marlyap import config, graph as graphs, store
-from marlyap.certificate import start_of, until
+from marlyap.certificate import start_of
 from marlyap.errors import UserError
 from marlyap.evaluation import Evaluation, episode, evaluate, pooled
 from marlyap.game import AbstractGame
 from marlyap.identity import policy_hash
 from marlyap.lyapunov_function import CostSum, at_target
-from marlyap.rollout import Controller, rollout
+from marlyap.rollout import Controller, rollout, until
 from marlyap.run import Run
 from marlyap.seeds import Purpose, stream
 from marlyap.types import Key, State, Trajectory
@@ -100,7 +100,7 @@ def one(run: Run, index: int, seed: int, label: str = "", episodes: int = 500) -
     keys = jax.random.split(stream(seed, "evaluate"), episodes)
     controller = run.controller()
     path = _episode(run.game, controller, keys[index])
-    values = None if L is None else _lyapunov(run.game, controller, L, path)
+    values = None if L is None else _lyapunov(run.game, controller, L, path)[:-1]
     return strip(run.game, path, values) | {
         "label": label or f"start {index}",
         "start": index,
@@ -110,7 +110,8 @@ def one(run: Run, index: int, seed: int, label: str = "", episodes: int = 500) -
 
 @eqx.filter_jit
 def _episode(game: AbstractGame, controller: Controller, key: Key) -> Trajectory:
-    return episode(game, controller, key)
+    """An episode and one step more, whose cost is that of the last state."""
+    return episode(game, controller, key, 1)
 
 
 @eqx.filter_jit
@@ -121,8 +122,8 @@ def _lyapunov(game: AbstractGame, controller: Controller, L: Any, path: Trajecto
 
 
 def strip(game: AbstractGame, path: Trajectory, lyapunov: jax.Array | None) -> dict[str, Any]:
-    """A trajectory as the plain values that are drawn."""
-    dynamics, state = game.dynamics, path.state
+    """All but the last state of a trajectory, as the plain values that are drawn."""
+    dynamics, state = game.dynamics, jax.tree.map(lambda leaf: leaf[:-1], path.state)
     headings = np.asarray(state.x[:, :, 2]).tolist() if "psi" in dynamics.names else None
     linked = np.asarray(jax.vmap(game.linked)(state))
     distance = np.asarray(jax.vmap(game.distance)(state)).max(axis=1)
@@ -138,8 +139,8 @@ def strip(game: AbstractGame, path: Trajectory, lyapunov: jax.Array | None) -> d
         "edges": edges[0] if all(e == edges[0] for e in edges) else edges,
         "distance": distance.tolist(),
         "lyapunov": None if lyapunov is None else np.asarray(lyapunov).tolist(),
-        "cost": [*cost.tolist(), float(distance[-1])] if len(cost) else [],
-        "success": bool(distance[-1] <= game.radius),
+        "cost": cost.tolist(),
+        "success": bool(game.success(jax.tree.map(lambda leaf: leaf[-1], state))),
     }
 
 
@@ -184,10 +185,10 @@ def certificates(run: Run) -> dict[str, list[dict[str, Any]]]:
 def _replay(
     game: AbstractGame, controller: Controller, V: CostSum | None, start: State
 ) -> tuple[Trajectory, jax.Array | None]:
-    """Two horizons from a start, and V along them."""
-    beyond = 0 if V is None else V.beyond
+    """Two horizons from a start and a step more, and V along the two."""
+    beyond = 1 if V is None else max(1, V.beyond)
     path = rollout(game, controller, start, jax.random.key(0), 2 * game.horizon + beyond)
-    seen = until(path, 2 * game.horizon)
+    seen = until(path, 2 * game.horizon + 1)
     return seen, None if V is None else V.along(game, path, 2 * game.horizon + 1)
 
 

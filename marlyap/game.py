@@ -17,14 +17,15 @@ from marlyap import graph as graphs
 from marlyap.dynamics import AbstractDynamics
 from marlyap.errors import UserError
 from marlyap.sensing import body_frame, goal_errors, near
-from marlyap.types import Action, Features, Key, Obs, Scalar, State
+from marlyap.types import Action, Features, Key, Links, Obs, Scalar, State
 
 
 class AbstractGame(eqx.Module):
     """A task says where an episode starts and what each agent sees.
 
     Its fields are its parameters. The dynamics, the graph and the judgement (cost, reward,
-    success) are given, and may be replaced.
+    success, violations) are given, and may be replaced. Everything that evaluates, certifies,
+    films or perturbs a game asks these methods and recomputes none of them.
     """
 
     agents: eqx.AbstractVar[int]
@@ -58,8 +59,16 @@ class AbstractGame(eqx.Module):
         """The state an episode starts from."""
 
     @abc.abstractmethod
-    def observe(self, state: State) -> Obs:
-        """o_i, row i made of agent i's own state and its neighbours' only (section 2.1)."""
+    def observe(self, state: State, links: Links) -> Obs:
+        """o_i, row i made of agent i's own state and of those it is linked to (section 2.1).
+
+        Take neighbours from `links`, never from `linked`: a wrapper that loses messages passes
+        fewer links than the graph has.
+        """
+
+    def observations(self, state: State) -> Obs:
+        """What every agent sees in this state, over the links that this game has there."""
+        return self.observe(state, self.linked(state))
 
     def distance(self, state: State) -> Float[Array, "agent"]:
         """How far each agent is from where it has to be (m)."""
@@ -100,18 +109,43 @@ class AbstractGame(eqx.Module):
         return jnp.mean(self.costs(state, action))
 
     def success(self, state: State) -> Bool[Array, ""]:
-        """Every agent is within `radius` of its goal."""
+        """Every agent is within `radius` of its goal: the one definition of success."""
         return jnp.all(self.distance(state) <= self.radius)
+
+    def violations(self, state: State) -> Bool[Array, "agent"]:
+        """Which agents break a rule of the game in this state, such as a collision; here none.
+
+        A violation neither ends an episode nor costs anything. It is counted beside success, and
+        the certificate `safe` is about it.
+        """
+        return jnp.zeros(self.agents, bool)
+
+    def crowded(self, state: State, gap: float) -> Bool[Array, "agent"]:
+        """Which agents are closer than `gap` (m) to another one: a rule for `violations`."""
+        p = self.positions(state)
+        apart = jnp.linalg.norm(p[:, None] - p[None, :], axis=-1)
+        return jnp.any((apart < gap) & ~jnp.eye(self.agents, dtype=bool), axis=1)
+
+    def motion(self, state: State) -> Float[Array, "agent"]:
+        """How much each agent moves: the sum of its squared rates, such as v^2 + omega^2."""
+        return jnp.sum(jax.vmap(self.dynamics.rates)(state.x) ** 2, axis=1)
+
+    def strengthened(self, gain: float | Array) -> "AbstractGame":
+        """The same game with inputs `gain` times as strong: its dynamics' limits are scaled.
+
+        A game whose `step` takes its limits from elsewhere has to replace this too.
+        """
+        limits = lambda game: game.dynamics.limits
+        return eqx.tree_at(limits, self, tuple(gain * u for u in limits(self)))
 
     def positions(self, state: State) -> Float[Array, "agent 2"]:
         """Where the agents are (m)."""
         return jax.vmap(self.dynamics.position)(state.x)
 
-    def local_view(self, state: State, headings: bool = False) -> Obs:
+    def local_view(self, state: State, links: Links, headings: bool = False) -> Obs:
         """The usual o_i: everything near agent i in its own frame (`sensing.body_frame`)."""
         slots, leads = jnp.asarray(self.slots), jnp.asarray(self.leads)
-        linked = self.linked(state)
-        return body_frame(self.dynamics, state, slots, linked, leads, self.radius, headings)
+        return body_frame(self.dynamics, state, slots, links, leads, self.radius, headings)
 
     @property
     def adjacency(self) -> Bool[np.ndarray, "agent agent"]:
@@ -128,8 +162,8 @@ class AbstractGame(eqx.Module):
         """Which agents know their goal."""
         return np.isin(np.arange(self.agents), self.leaders)
 
-    def linked(self, state: State) -> Bool[Array, "agent agent"]:
-        """Which pairs interact in this state."""
+    def linked(self, state: State) -> Links:
+        """Which pairs interact in this state: row i says whom agent i sees."""
         linked = jnp.asarray(self.adjacency)
         reach = graphs.disk_radius(self.graph)
         if reach is None:

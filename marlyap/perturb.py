@@ -1,12 +1,13 @@
 """The same game, disturbed: what a controller meets that it was not made for."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from marlyap import graph as graphs
 from marlyap.dynamics import AbstractDynamics
@@ -19,9 +20,15 @@ from marlyap.types import State
 class Perturbed(AbstractGame):
     """`inner` with stronger or weaker inputs, noise, delay, lost messages, agents or edges.
 
-    A controller made for `inner` drives it unchanged. Agents that are gone are seen by nobody and
-    judged by nobody. What is drawn at random (noise, lost messages) follows from a seed that
-    `reset` leaves in the state's memory, and the actions under way lie there too.
+    A controller made for `inner` drives it unchanged. Every method of `inner` is asked, with the
+    state as `inner` knows it, so that whatever a task replaces is what is perturbed; perturbations
+    may be nested. Agents that are gone are seen by nobody and judged by nobody.
+
+    What is drawn at random (noise, lost messages) follows from a seed that `reset` leaves in the
+    state's memory, beside the actions under way and the memory of `inner`.
+
+    Raises UserError for values out of range, and for `gone` where `inner` has a judgement of its
+    own about the whole team, which cannot leave an agent out.
     """
 
     inner: AbstractGame
@@ -41,6 +48,12 @@ class Perturbed(AbstractGame):
         missing = {*self.gone, *(i for edge in self.cut for i in edge)}
         if not missing <= set(range(self.inner.agents)):
             raise UserError(f"perturbation: {sorted(missing)} names an agent that is not there.")
+        own = judges_as_a_team(self.inner)
+        if self.gone and own:
+            raise UserError(
+                f"perturbation: an agent of {own[0]} cannot be taken away, since it replaces "
+                f"`{own[1]}`, which judges the whole team; leave out gone."
+            )
 
     # What the game inside says.
     agents = property(lambda self: self.inner.agents)  # pyright: ignore[reportAssignmentType]
@@ -61,10 +74,13 @@ class Perturbed(AbstractGame):
         return getattr(self.inner, name)
 
     @property
+    def plant(self) -> AbstractGame:
+        """The game inside, with inputs as strong as they are here."""
+        return self.inner.strengthened(self.gain) if _on(self.gain - 1) else self.inner
+
+    @property
     def dynamics(self) -> AbstractDynamics:
-        nominal = self.inner.dynamics
-        limits = tuple(self.gain * u for u in nominal.limits)
-        return eqx.tree_at(lambda d: d.limits, nominal, limits) if _on(self.gain - 1) else nominal
+        return self.plant.dynamics
 
     @property
     def present(self) -> Bool[np.ndarray, "agent"]:
@@ -78,46 +94,97 @@ class Perturbed(AbstractGame):
             linked[a, b] = linked[b, a] = False
         return linked
 
-    def linked(self, state: State) -> Bool[Array, "agent agent"]:
-        linked = self.inner.linked(state) & jnp.asarray(self.adjacency)
-        if not _on(self.drop) or state.memory is None:
+    def strengthened(self, gain):
+        return dataclasses.replace(self, inner=self.inner.strengthened(gain))
+
+    def inside(self, state: State) -> State:
+        """The state as the game inside knows it."""
+        memory = state.memory["inner"]
+        return State(x=state.x, goal=state.goal, t=state.t, memory=memory)
+
+    def reset(self, key):
+        start = self.inner.reset(key)
+        x = start.x.at[:, :2].multiply(self.spread)
+        seed = branch(key, "perturb")
+        for _ in range(depth(self.inner)):  # nested perturbations draw other numbers
+            seed = jax.random.fold_in(seed, 3)
+        queue = jnp.zeros((self.delay, self.agents, self.dynamics.du))
+        memory = {"seed": jax.random.key_data(seed), "queue": queue, "inner": start.memory}
+        return State(x=x, goal=start.goal, t=start.t, memory=memory)
+
+    def linked(self, state):
+        linked = self.inner.linked(self.inside(state)) & jnp.asarray(self.adjacency)
+        if not _on(self.drop):
             return linked
         key = jax.random.fold_in(self._key(state, 1), state.t)
         return linked & ~jax.random.bernoulli(key, self.drop, linked.shape)
 
-    def reset(self, key):
-        start = self.inner.reset(key)
-        if start.memory is not None:
-            raise UserError("perturbation: this game keeps a memory of its own; perturb it inside.")
-        x = start.x.at[:, :2].multiply(self.spread)
-        seed = jax.random.key_data(branch(key, "perturb"))
-        queue = jnp.zeros((self.delay, self.agents, self.dynamics.du))
-        return State(x=x, goal=start.goal, t=start.t, memory={"seed": seed, "queue": queue})
-
-    def observe(self, state):
-        # The game inside reads its own method, with this game's `linked`.
-        return type(self.inner).observe(self, state)  # pyright: ignore[reportArgumentType]
+    def observe(self, state, links):
+        return self.inner.observe(self.inside(state), links)
 
     def step(self, state, action):
         queue = jnp.concatenate([state.memory["queue"], action[None]])
         now, key = queue[0], jax.random.fold_in(self._key(state, 2), state.t)
         if _on(self.noise):
             now = now + self.noise * jax.random.normal(key, now.shape)
-        after = type(self.inner).step(self, state, now)  # pyright: ignore[reportArgumentType]
-        memory = state.memory | {"queue": queue[1:]}
+        after = self.plant.step(self.inside(state), now)
+        memory = state.memory | {"queue": queue[1:], "inner": after.memory}
         return State(x=after.x, goal=after.goal, t=after.t, memory=memory)
 
+    def features(self, state):
+        return self.inner.features(self.inside(state))
+
+    def terminated(self, state):
+        return self.inner.terminated(self.inside(state))
+
+    def positions(self, state):
+        return self.inner.positions(self.inside(state))
+
+    def motion(self, state):
+        return self._of_those_present(self.inner.motion(self.inside(state)))
+
     def distance(self, state):
-        return jnp.where(jnp.asarray(self.present), self.inner.distance(state), 0.0)
+        return self._of_those_present(self.inner.distance(self.inside(state)))
 
     def costs(self, state, action):
-        return jnp.where(jnp.asarray(self.present), self.inner.costs(state, action), 0.0)
+        return self._of_those_present(self.inner.costs(self.inside(state), action))
+
+    def rewards(self, state, action):
+        return self._of_those_present(self.inner.rewards(self.inside(state), action))
 
     def errors(self, state):
-        return jnp.where(jnp.asarray(self.present)[:, None], self.inner.errors(state), 0.0)
+        errors = self.inner.errors(self.inside(state))
+        return jnp.where(jnp.asarray(self.present)[:, None], errors, 0.0)
+
+    def success(self, state):
+        return super().success(state) if self.gone else self.inner.success(self.inside(state))
+
+    def violations(self, state):
+        away = jnp.where(jnp.asarray(self.present), 0.0, 1e4 * (1 + jnp.arange(self.agents)))
+        x = state.x.at[:, :2].add(away[:, None])  # nobody collides with an agent that is gone
+        there = self.inner.violations(self.inside(eqx.tree_at(lambda s: s.x, state, x)))
+        return there & jnp.asarray(self.present)
+
+    def _of_those_present(self, values: Float[Array, "agent"]) -> Float[Array, "agent"]:
+        return jnp.where(jnp.asarray(self.present), values, 0.0)
 
     def _key(self, state: State, purpose: int) -> Array:
         return jax.random.fold_in(jax.random.wrap_key_data(state.memory["seed"]), purpose)
+
+
+def depth(game: AbstractGame) -> int:
+    """How many perturbations lie one inside the other."""
+    return 1 + depth(game.inner) if isinstance(game, Perturbed) else 0
+
+
+def judges_as_a_team(game: AbstractGame) -> tuple[str, str] | None:
+    """The task and its own method that judges all agents together, if it replaces one."""
+    if isinstance(game, Perturbed):
+        return judges_as_a_team(game.inner)
+    for name in ("success", "terminated"):
+        if getattr(type(game), name) is not getattr(AbstractGame, name):
+            return type(game).__name__, name
+    return None
 
 
 def traced(game: Perturbed) -> Perturbed:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from marlyap.game import AbstractGame
 from marlyap.types import Action, Key, Obs, State, Trajectory
@@ -50,7 +50,7 @@ class Decentralised(eqx.Module):
     game: AbstractGame
 
     def __call__(self, state: State, key: Key) -> Action:
-        return self.policy(self.game.observe(state), key)
+        return self.policy(self.game.observations(state), key)
 
 
 class AbstractPlanner(eqx.Module):
@@ -101,3 +101,16 @@ def first_fault(x: Float[Array, "episode time agent *rest"]) -> Int[Array, ""]:
     """step * agents + agent of the first number that is not finite; -1 where all are."""
     bad = jnp.any(~jnp.isfinite(x), axis=(0, *range(3, x.ndim)))
     return jnp.where(jnp.any(bad), jnp.argmax(bad), -1)
+
+
+def finite(tree: PyTree) -> Bool[Array, ""]:
+    """Whether every number in the tree is finite."""
+    numbers = [x for x in jax.tree.leaves(tree) if eqx.is_inexact_array(x)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in numbers]))
+
+
+def until(trajectory: Trajectory, steps: int) -> Trajectory:
+    """The rollout as if it had stopped after `steps` steps."""
+    cut = lambda tree, end: jax.tree.map(lambda leaf: leaf[:end], tree)
+    parts = {k: cut(v, steps) for k, v in vars(trajectory).items() if k != "state"}
+    return Trajectory(state=cut(trajectory.state, steps + 1), **parts)

@@ -215,7 +215,7 @@ class Run:
 
 def _fits(policy: Policy, game: AbstractGame) -> bool:
     """Whether the policy takes the game's observations and acts for all of its agents."""
-    act = lambda key: policy(game.observe(game.reset(key)), key)
+    act = lambda key: policy(game.observations(game.reset(key)), key)
     try:
         action = eqx.filter_eval_shape(act, jax.random.key(0))
     except (TypeError, ValueError):

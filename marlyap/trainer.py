@@ -74,7 +74,7 @@ class Carry(eqx.Module):
 def shape(game: AbstractGame) -> Shape:
     """What the algorithm may know of the game."""
     state = eqx.filter_eval_shape(game.reset, jax.random.key(0))
-    see = lambda s: (game.observe(s), game.features(s), game.errors(s))
+    see = lambda s: (game.observations(s), game.features(s), game.errors(s))
     obs, features, errors = eqx.filter_eval_shape(see, state)
     return Shape(game.agents, obs.shape[1], features.shape[1], errors.shape[1], game.dynamics.du)
 
@@ -178,19 +178,24 @@ class Trainer(eqx.Module):
     def judge(self, carry: Carry) -> tuple[Carry, dict[str, Scalar]]:
         """Look at the policy from starts kept for this alone, and keep it if it is the best.
 
-        Its score is the success rate, plus a tenth of that at half the radius to break ties.
+        Its score is the success rate, plus a tenth of that at half the radius. Ties are broken by
+        how far and how fast the agents end, which count for less than one start in all.
         """
         policy = self.algorithm.exploit(carry.learner)
         keys = spread(jax.random.split(stream(0, "select"), self.schedule.judge_episodes))
-        final = outcomes(self.game, Decentralised(policy, self.game), keys).final
-        within = lambda r: jnp.mean((final <= r).astype(float))
-        score = within(self.game.radius) + 0.1 * within(self.game.radius / 2)
+        seen = outcomes(self.game, Decentralised(policy, self.game), keys)
+        rate = lambda hits: jnp.mean(hits.astype(float))
+        near = rate(seen.success & (seen.final <= self.game.radius / 2))
+        less = lambda x, unit: jnp.mean(jnp.nan_to_num(1 / (1 + x / unit)))
+        tie = less(seen.final, self.game.radius) + less(seen.speed + seen.spin, 1.0)
+        score = rate(seen.success) + 0.1 * near + 0.02 * tie / self.schedule.judge_episodes
         better = score >= carry.score
         keep = lambda new, old: jnp.where(better, new, old) if eqx.is_array(new) else new
         best = jax.tree.map(keep, policy, carry.best)
         score = jnp.maximum(score, carry.score)
         carry = Carry(carry.learner, carry.memory, carry.key, carry.iteration, best, score)
-        return carry, {"success": within(self.game.radius), "distance": jnp.mean(final)}
+        look = {"success": rate(seen.success), "distance": jnp.mean(seen.final)}
+        return carry, look | {"speed": jnp.mean(seen.speed), "spin": jnp.mean(seen.spin)}
 
     def play(self, policy: AbstractExplorer, key: Key, episodes: int) -> Episode:
         """`episodes` fresh episodes, as the memory keeps them."""
@@ -203,7 +208,7 @@ class Trainer(eqx.Module):
             long = rollout(game, controller, game.reset(k_start), k_act, game.horizon + further * T)
             state = jax.tree.map(lambda x: x[: game.horizon + 1], long.state)
             to_go, ahead = cost_to_go(long.cost, T, game.horizon)
-            obs = jax.vmap(game.observe)(state)
+            obs = jax.vmap(game.observations)(state)
             action = long.action[: game.horizon]
             return Episode(
                 obs=obs,

@@ -14,6 +14,7 @@ Keys = jaxtyping.Key[Array, "episode"]
 Scalar = Float[Array, ""]
 Action = Float[Array, "agent du"]
 Obs = Float[Array, "agent obs"]
+Links = Bool[Array, "agent agent"]
 Features = Float[Array, "agent feature"]
 
 

@@ -54,7 +54,7 @@ class Flow(AbstractGame):
         x = jax.random.uniform(key, (1, 2), minval=-2.0, maxval=2.0)
         return State(x=x, goal=jnp.zeros((1, 2)), t=jnp.asarray(0))
 
-    def observe(self, state):
+    def observe(self, state, links):
         return state.x
 
     def step(self, state, action):
@@ -295,12 +295,14 @@ def test_a_perturbation_changes_what_it_says():
     assert not np.allclose(step(noise=0.1).x, nominal.x)
     far = Perturbed(game, spread=2.0).reset(key)
     assert np.allclose(far.x[:, :2], 2 * plain.x[:, :2])
-    obs, at = game.observe(plain), Perturbed(game, cut=((1, 2),))
-    assert np.array_equal(at.observe(plain)[0], obs[0])
-    assert not np.asarray(at.observe(plain)[2])[-7:].any() and np.asarray(obs[2]).any()
+    obs, at = game.observations(plain), Perturbed(game, cut=((1, 2),))
+    apart = np.asarray(at.observations(at.reset(key)))
+    assert np.array_equal(apart[0], obs[0])
+    assert not apart[2][-7:].any() and np.asarray(obs[2]).any()
     lost = Perturbed(game, gone=(2,))
-    assert float(lost.distance(plain)[2]) == 0.0
-    assert not np.asarray(lost.linked(plain))[2].any()
+    there = lost.reset(key)
+    assert float(lost.distance(there)[2]) == 0.0
+    assert not np.asarray(lost.linked(there))[2].any()
     silent = Perturbed(game, drop=1.0)
     assert not np.asarray(silent.linked(silent.reset(key))).any()
 

@@ -71,14 +71,14 @@ class TimeIsAFloat(Sound):
 
 @breaks("shapes", r"observe: it is float32\[2, \d+\]; return floating\[3, any\]")
 class OneAgentSeesNothing(Sound):
-    def observe(self, state):
-        return super().observe(state)[1:]
+    def observe(self, state, links):
+        return super().observe(state, links)[1:]
 
 
 @breaks("shapes", "observe: it is int32.*return float32")
 class WholeNumbersAreSeen(Sound):
-    def observe(self, state):
-        return super().observe(state).astype(int)
+    def observe(self, state, links):
+        return super().observe(state, links).astype(int)
 
 
 @breaks("shapes", r"costs: it is float32\[\]; return floating\[3\]")
@@ -166,8 +166,8 @@ def _(size, batched, x):
 
 @breaks("batched", "observe: under jax.vmap it differs")
 class ViewOfTheWholeBatch(Sound):
-    def observe(self, state):
-        return alone(super().observe(state))
+    def observe(self, state, links):
+        return alone(super().observe(state, links))
 
 
 @breaks("traced_once", "fields: an equal task is compiled again")
@@ -225,16 +225,16 @@ class GoalMoves(Sound):
 
 @breaks("local", "observe: a row changes with agent [02], which is not its neighbour")
 class EverybodySeesEverybody(Sound):
-    def observe(self, state):
+    def observe(self, state, links):
         return jnp.concatenate(
-            [super().observe(state), jnp.broadcast_to(state.x[:, 0], (3, 3))], axis=1
+            [super().observe(state, links), jnp.broadcast_to(state.x[:, 0], (3, 3))], axis=1
         )
 
 
 @breaks("local", "observe: a row changes with the goal of agent 1, which is not theirs to see")
 class FollowersSeeTheirGoal(Sound):
-    def observe(self, state):
-        return jnp.concatenate([super().observe(state), state.goal - state.x], axis=1)
+    def observe(self, state, links):
+        return jnp.concatenate([super().observe(state, links), state.goal - state.x], axis=1)
 
 
 @breaks("bounded_inputs", "step: an action of 4 does more than one of 1")
@@ -432,7 +432,7 @@ class Mine(Rendezvous):
     dynamics: SingleIntegrator = SingleIntegrator()
 
 class Bad(Mine):
-    def observe(self, state):
+    def observe(self, state, links):
         return state.x[:1]
 """
 

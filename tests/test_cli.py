@@ -452,8 +452,8 @@ class Poisoned(Rendezvous):
     def poison(self, state, value, what):
         return jnp.where((self.bad == what) & (state.goal[0, 0] > self.edge), jnp.nan, value)
 
-    def observe(self, state):
-        return self.poison(state, super().observe(state), "observe")
+    def observe(self, state, links):
+        return self.poison(state, super().observe(state, links), "observe")
 
     def costs(self, state, action):
         return self.poison(state, super().costs(state, action), "costs")

@@ -146,7 +146,7 @@ def test_a_policy_runs_with_another_number_of_agents(run, agents):
     def act(key):
         """What all do, and what the first does when it is asked alone."""
         state = game.reset(key)
-        return controller(state, key), policy(game.observe(state)[:1], key)
+        return controller(state, key), policy(game.observations(state)[:1], key)
 
     together, alone = act(KEY)
     assert together.shape == (agents, 2)

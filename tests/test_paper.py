@@ -777,7 +777,7 @@ class Table(NormNet):
 def seen(game):
     """The costs of a long closed-loop rollout, and the certificate that reads L off a table."""
     shape = Shape(3, 14, 8, 4, 2)
-    see = eqx.filter_eval_shape(lambda k: game.observe(game.reset(k)), KEY)
+    see = eqx.filter_eval_shape(lambda k: game.observations(game.reset(k)), KEY)
     pi = filled(lambda k: Actors(shape._replace(obs=see.shape[1]), 8, key=k), KEY)
     play = eqx.filter_jit(lambda pi, key: rollout(
         game, Decentralised(Greedy(pi), game), game.reset(key), key, 60))  # fmt: skip

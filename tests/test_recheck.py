@@ -57,7 +57,7 @@ GAME = Rendezvous(agents=2, leaders=(0, 1), dynamics=SingleIntegrator(limits=(2.
 def shape(game):
     def seen():
         state = game.reset(jax.random.key(0))
-        return game.observe(state), game.features(state), game.errors(state)
+        return game.observations(state), game.features(state), game.errors(state)
 
     obs, features, errors = (x.shape[1] for x in jax.eval_shape(seen))
     return Shape(game.agents, obs, features, errors, game.dynamics.du)

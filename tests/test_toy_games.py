@@ -67,14 +67,14 @@ class Toy(AbstractGame):
         draw = lambda k: jax.random.uniform(k, (2, 2), minval=-1.0, maxval=1.0)
         return State(x=draw(k_x), goal=draw(k_goal), t=jnp.asarray(0))
 
-    def observe(self, state):
+    def observe(self, state, links):
         return state.goal - state.x
 
     def terminated(self, state):
         return (self.kind == BANDIT) & (state.t >= 1)
 
     def costs(self, state, action):
-        miss = jnp.sum((action - 0.4 * self.observe(state)) ** 2, axis=1)
+        miss = jnp.sum((action - 0.4 * self.observations(state)) ** 2, axis=1)
         bandit = jnp.where(self.kind == BANDIT, miss, 0.0)
         return jnp.where(self.kind == REACH, self.distance(state), bandit)
 
@@ -108,7 +108,7 @@ def look(trainer, learner):
 
     def one(key):
         state = game.reset(key)
-        obs = game.observe(state)
+        obs = game.observations(state)
         action = policy(obs, key)
         if isinstance(algorithm, DecentralisedSAC):  # a critic for each agent, of what it observes
             each = eqx.filter_vmap(lambda Q, o, a: Q(o[None], a[None]))

@@ -124,11 +124,11 @@ def test_episodes_are_the_game_played_by_the_policy(trainer, later):
         e = trainer.play(trainer.algorithm.explore(learner), key, 1)
         k_start, _ = jax.random.split(jax.random.split(key, 1)[0])
         state = game.reset(k_start)
-        see = lambda s, a: (game.observe(s), game.features(s), game.costs(s, a))
+        see = lambda s, a: (game.observations(s), game.features(s), game.costs(s, a))
         step = lambda s, a: (game.step(s, a), see(s, a))
         last, seen = jax.lax.scan(step, state, e.action[0])
         log_prob = jax.vmap(Sampled(learner.pi.value).log_prob)(e.obs[0, :-1], e.action[0])
-        return e, seen, (game.observe(last), game.features(last)), log_prob
+        return e, seen, (game.observations(last), game.features(last)), log_prob
 
     e, (obs, features, costs), last, log_prob = played(trainer, learner, key)
     for got, want, end in ((e.obs[0], obs, last[0]), (e.features[0], features, last[1])):
@@ -276,7 +276,10 @@ def test_outcomes_are_those_of_the_trajectories(wide):
     e = seen(wide, 0.3, 1)
     distance = np.linalg.norm(e.state.x[..., :2] - e.state.goal, axis=-1).max(-1)  # [episode, time]
     np.testing.assert_allclose(got.final, distance[:, -1], rtol=1e-5)
-    np.testing.assert_allclose(got.held, distance[:, -5:].max(1), rtol=1e-5)
+    np.testing.assert_array_equal(got.held, (distance[:, -5:] <= wide.radius).all(1))
+    spin = np.abs(e.state.x[:, -1, :, 4]).max(1)
+    np.testing.assert_allclose(got.spin, spin, atol=1e-6)
+    np.testing.assert_array_equal(got.at_rest, got.successes & (got.speed <= 0.1) & (spin <= 0.1))
     np.testing.assert_allclose(got.speed, np.abs(e.state.x[:, -1, :, 3]).max(1), atol=1e-6)
     np.testing.assert_allclose(got.total, e.reward.mean(2).sum(1), rtol=1e-5)
     kinds = set()
@@ -309,3 +312,10 @@ def test_no_episodes_are_refused(game):
     for episodes in (0, -1):
         with pytest.raises(UserError, match="^episodes: "):
             evaluate(game, push(0.0), episodes)
+    with pytest.raises(UserError, match="^beyond: "):
+        evaluate(game, push(0.0), 1, beyond=-1)
+
+
+def test_a_controller_of_the_wrong_shape_is_refused(game):
+    with pytest.raises(UserError, match=r"^controller: it returns an action of shape \[3\], "):
+        evaluate(game, lambda state, key: jnp.zeros(3), 4)

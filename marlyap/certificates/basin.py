@@ -12,10 +12,10 @@ from marlyap.certificate import (
     at_least,
     judged,
     scope,
-    until,
     worst_of,
 )
 from marlyap.certificates.reach import ReachAndStay
+from marlyap.rollout import until
 from marlyap.statistics import bonferroni, clopper_pearson, trials_needed
 
 

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from marlyap.dynamics import AbstractDynamics, Unicycle
-from marlyap.errors import UserError
+from marlyap.errors import UserError, within
 from marlyap.game import AbstractGame
-from marlyap.tasks.rendezvous import scatter
+from marlyap.tasks.rendezvous import scatter, with_motion
 from marlyap.types import State
 
 
@@ -25,6 +25,8 @@ class Formation(AbstractGame):
     radius: float = 0.1  # an agent has arrived when it is this close to its place (m)
     size: float = 1.0  # starts and centres are uniform in [-size, size]^2 (m)
     headings: bool = False  # whether neighbours' headings are seen
+    rest_weight: float = 0.0  # of the squared rates in the cost, so that agents come to rest
+    clearance: float = 0.0  # agents closer than this to another one violate it (m)
     dt: float = 0.1  # s
     horizon: int = 40  # steps in an episode
     dynamics: AbstractDynamics = Unicycle()
@@ -32,6 +34,8 @@ class Formation(AbstractGame):
     def __check_init__(self):
         if not 0 < self.spread < 1e6:
             raise UserError(f"spread: {self.spread} m must be a positive distance in metres.")
+        within("rest_weight", self.rest_weight, 0, 1e6)
+        within("clearance", self.clearance, 0, 1e6)
 
     def reset(self, key):
         k_start, k_turn = jax.random.split(key)
@@ -44,5 +48,11 @@ class Formation(AbstractGame):
         angle = turn + 2 * jnp.pi * jnp.arange(self.agents) / self.agents
         return self.spread * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
 
-    def observe(self, state):
-        return self.local_view(state, self.headings)
+    def observe(self, state, links):
+        return self.local_view(state, links, self.headings)
+
+    def costs(self, state, action):
+        return with_motion(self, self.distance(state), state, self.rest_weight)
+
+    def violations(self, state):
+        return self.crowded(state, self.clearance)

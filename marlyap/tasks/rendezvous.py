@@ -2,9 +2,10 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from marlyap.dynamics import AbstractDynamics, Unicycle
-from marlyap.errors import UserError
+from marlyap.errors import UserError, within
 from marlyap.game import AbstractGame
 from marlyap.types import Key, State
 
@@ -13,7 +14,7 @@ class Rendezvous(AbstractGame):
     """Agents start at rest anywhere in a square and end within `radius` of one target.
 
     The target is drawn anew each episode, or followers could learn it by heart. The cost of an
-    agent is its distance to the target (m).
+    agent is its distance to the target (m), plus `rest_weight` (v^2 + omega^2).
     """
 
     agents: int = 3  # N
@@ -22,6 +23,7 @@ class Rendezvous(AbstractGame):
     radius: float = 0.1  # an agent has arrived when it is this close (m)
     size: float = 1.0  # starts and targets are uniform in [-size, size]^2 (m)
     headings: bool = False  # whether neighbours' headings are seen
+    rest_weight: float = 0.0  # of the squared rates in the cost, so that agents come to rest
     dt: float = 0.1  # s
     horizon: int = 40  # steps in an episode
     dynamics: AbstractDynamics = Unicycle()
@@ -29,12 +31,16 @@ class Rendezvous(AbstractGame):
     def __check_init__(self):
         if not 0 < self.size < 1e6:
             raise UserError(f"size: {self.size} m must be a positive distance in metres.")
+        within("rest_weight", self.rest_weight, 0, 1e6)
 
     def reset(self, key):
         return scatter(self.dynamics, self.agents, self.size, key)
 
-    def observe(self, state):
-        return self.local_view(state, self.headings)
+    def observe(self, state, links):
+        return self.local_view(state, links, self.headings)
+
+    def costs(self, state, action):
+        return with_motion(self, self.distance(state), state, self.rest_weight)
 
 
 def scatter(dynamics: AbstractDynamics, agents: int, size: float, key: Key) -> State:
@@ -45,3 +51,10 @@ def scatter(dynamics: AbstractDynamics, agents: int, size: float, key: Key) -> S
     x = jax.vmap(dynamics.rest)(spread(k_position, (agents, 2)), angle)
     goal = jnp.broadcast_to(spread(k_target, (2,)), (agents, 2))
     return State(x=x, goal=goal, t=jnp.asarray(0))
+
+
+def with_motion(
+    game: AbstractGame, distance: Float[Array, "agent"], state: State, weight: float
+) -> Float[Array, "agent"]:
+    """distance + weight (v^2 + omega^2): without the second term, motion at the goal is free."""
+    return distance + weight * game.motion(state) if weight else distance
