@@ -23,6 +23,17 @@ TASK and ALGORITHM may also be path/to/file.py:Name, code of your own.
 """
 
 
+SEED = "of the starts (default 0), or the word draw for starts that nobody has seen"
+
+
+def seed_of_starts(word: str) -> int | str:
+    """A whole number, or the word draw."""
+    return word if word == "draw" else int(word)
+
+
+seed_of_starts.__name__ = "seed"  # what argparse calls it in an error
+
+
 class Parser(argparse.ArgumentParser):
     """Errors are one sentence and exit code 2, like every other bad input."""
 
@@ -79,13 +90,14 @@ def parser() -> Parser:
     )
     p.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
 
-    p = verb("evaluate", "measure runs or hand-written controllers on fresh starts", OVERRIDES)
+    p = verb("evaluate", "measure runs or hand-written controllers on held-out starts", OVERRIDES)
     p.add_argument("runs", nargs="+", metavar="RUN", help="run directories or controller names")
     p.add_argument("--task", default=None, help="the task, for controllers or tasks of your own")
     p.add_argument("--algorithm", default=None, help="the algorithm, where it is your own code")
-    p.add_argument("--episodes", type=int, default=500, help="fresh starts (default 500)")
-    p.add_argument("--seed", type=int, default=0, help="of the starts (default 0)")
+    p.add_argument("--episodes", type=int, default=500, help="held-out starts (default 500)")
+    p.add_argument("--seed", type=seed_of_starts, default=0, help=SEED)
     p.add_argument("--confidence", type=float, default=0.95, help="of the intervals")
+    p.add_argument("--out", type=Path, default=None, help="file for the figures, as JSON")
 
     p = verb("certify", "say what holds of a run or controller, with what evidence", OVERRIDES)
     p.add_argument("run", metavar="RUN", help="a run directory or a controller name")
@@ -108,16 +120,17 @@ def parser() -> Parser:
 
     p = verb("report", "write one HTML file (and PNGs) about runs")
     p.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run directories")
-    p.add_argument("--out", type=Path, default=None, help="HTML file (default in the first run)")
-    p.add_argument("--episodes", type=int, default=500, help="fresh starts (default 500)")
-    p.add_argument("--seed", type=int, default=0, help="of the starts (default 0)")
+    place = "HTML file (default: in the run; of several runs, ./report.html)"
+    p.add_argument("--out", type=Path, default=None, help=place)
+    p.add_argument("--episodes", type=int, default=500, help="held-out starts (default 500)")
+    p.add_argument("--seed", type=seed_of_starts, default=0, help=SEED)
     p.add_argument("--task", default=None, help="the task, where it is your own code")
     p.add_argument("--algorithm", default=None, help="the algorithm, where it is your own code")
 
     p = verb("watch", "film one episode of a run, as GIF and HTML")
     p.add_argument("run", type=Path, metavar="RUN", help="a run directory")
     p.add_argument("--episode", type=int, default=0, help="which of the evaluation starts")
-    p.add_argument("--seed", type=int, default=0, help="of the starts (default 0)")
+    p.add_argument("--seed", type=seed_of_starts, default=0, help=SEED)
     p.add_argument(
         "--out", type=Path, default=None, help="where to put the film (default: the run)"
     )

@@ -2,11 +2,12 @@
 
 import dataclasses
 import json
+import secrets
 import shlex
 import sys
 import time
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from marlyap import config, film, store
+from marlyap import config, film, groups, store
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.algorithms import ALGORITHMS, PRESETS
 from marlyap.certificate import Verdict
@@ -24,7 +25,7 @@ from marlyap.certify import certify, save
 from marlyap.conformance import conformance
 from marlyap.controllers import CONTROLLERS
 from marlyap.errors import UserError
-from marlyap.evaluation import Evaluation, compare, evaluate, pooled
+from marlyap.evaluation import RESTS, evaluate
 from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import cost_sum
 from marlyap.recheck import recheck
@@ -137,104 +138,146 @@ def seeds(words: list[str]) -> list[int]:
 
 
 def measure(args: Namespace, overrides: Overrides) -> Result:
-    """`evaluate`: every run and controller on the same fresh starts."""
+    """`evaluate`: every run and controller on the same held-out starts."""
     if not 0 < args.confidence < 1:
         raise UserError(f"confidence: {args.confidence} must lie between 0 and 1.")
+    if args.out is not None and not args.out.parent.is_dir():
+        raise UserError(f"out: there is no directory {args.out.parent}.")
+    starts = starts_of(args.seed)
     game, algorithm = own_code(args, overrides if args.task else {})
-    found: list[tuple[str, str, Any, Evaluation]] = []
+    found: list[groups.Measured] = []
     directories = []
     for word in args.runs:
         if word in CONTROLLERS:
             if game is None:
                 raise UserError(f"task: {word} needs --task, the task it is to be measured on.")
-            result = evaluate(game, CONTROLLERS[word](game), args.episodes, args.seed)
-            found.append((word, word, None, result))
+            result = evaluate(game, CONTROLLERS[word](game), args.episodes, starts)
+            found.append(groups.of_controller(word, game, result, starts))
         elif Path(word).exists():
             directories.append(Path(word))
         else:
             hint = config.suggest(word, CONTROLLERS)
             raise UserError(f"run: there is no run or controller '{word}'; {hint}")
+    notes = []
     for directory in expand(directories):
         run = Run.open(directory, game, algorithm)
         there = changed(run.game, overrides)
         controller = run.controller(there) if overrides else run.controller()
-        result = evaluate(there, controller, args.episodes, args.seed)
-        found.append((str(directory), group(run), run, result))
-    rows = [
-        {"name": name, "group": g, "seed": run.seed if run else None} | e.summary(args.confidence)
-        for name, g, run, e in found
-    ]
-    for (_, _, run, _), row in zip(found, rows, strict=True):
-        if run and not overrides:
-            store.write_text_atomic(
-                run.directory / "evaluation.json", json.dumps(row, indent=1) + "\n"
-            )
-    names = list(dict.fromkeys(g for _, g, _, _ in found))
-    together = {n: pooled([e for _, g, _, e in found if g == n]) for n in names}
-    groups = [{"group": n} | e.summary(args.confidence) for n, e in together.items()]
-    pairs = comparisons(found)
-    whole = pooled([e for *_, e in found]).summary(args.confidence)
+        result = evaluate(there, controller, args.episodes, starts)
+        found.append(groups.of_run(run, result, starts, there))
+        done, whole = film.progress(run)
+        if done < whole:
+            notes.append(f"{directory}: training is unfinished ({done} of {whole} steps).")
+        if groups.same_game(there, run.game):
+            notes += keep(run, row_of(found[-1], args.confidence))
+    result = {
+        "start_seed": starts,
+        "runs": [row_of(m, args.confidence) for m in found],
+        "groups": [
+            {"group": name} | groups.summary(members, args.confidence)
+            for name, members in groups.grouped(found).items()
+        ],
+        "comparisons": groups.comparisons(found),
+    }
+    if len(result["groups"]) == 1:  # over several configurations there is nothing to say
+        result = {k: v for k, v in result["groups"][0].items() if k != "group"} | result
+    if args.out is not None:
+        store.write_text_atomic(args.out, json.dumps(result, indent=1) + "\n")
     if not args.json:
-        tabulate(rows, groups, pairs)
-    return whole | {
-        "start_seed": args.seed,
-        "runs": rows,
-        "groups": groups,
-        "comparisons": pairs,
-    }, 0
+        tabulate(result, found)
+    for note in notes:
+        say(note)
+    return result, 0
 
 
-def group(run: Run) -> str:
-    """Runs that differ in their seed alone belong together."""
-    preset = run.names["preset"]
-    return f"{run.names['task']} {run.names['algorithm']}" + (
-        f" ({preset})" if preset not in ("", "tuned") else ""
+def starts_of(seed: int | str) -> int:
+    """The seed of the starts; a fresh one for the word draw."""
+    return secrets.randbelow(2**31) if seed == "draw" else int(seed)
+
+
+def row_of(measured: groups.Measured, confidence: float) -> dict[str, Any]:
+    """One run's or controller's figures, with all that they depend on."""
+    about = {"name": measured.name, "group": measured.base, "seed": measured.seed}
+    about |= {"start_seed": measured.starts, "game": config.record(measured.game)}
+    return about | measured.evaluation.summary(confidence)
+
+
+def keep(run: Run, row: dict[str, Any]) -> list[str]:
+    """Leave the figures in the run; where that cannot be, say so."""
+    try:
+        store.write_text_atomic(run.directory / "evaluation.json", json.dumps(row, indent=1) + "\n")
+    except UserError as error:
+        return [f"evaluation.json was not written: {error}"]
+    return []
+
+
+def tabulate(result: dict[str, Any], found: Sequence[groups.Measured]) -> None:
+    """The evaluation as a table on standard output, and what it says in words."""
+    rows, teams = result["runs"], result["groups"]
+    first, radii = rows[0], {row["radius"] for row in rows}
+    near = f"{radii.pop():g} m" if len(radii) == 1 else "the task's radius"
+    ruled = any(rules(m.game) for m in found) or any(r["violations"]["successes"] for r in rows)
+    title = f"{first['episodes']} held-out starts of seed {result['start_seed']}; "
+    title += f"success: all within {near} at the last step"
+    table = Table(
+        title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True
     )
-
-
-def comparisons(found: list[tuple[str, str, Any, Evaluation]]) -> list[dict[str, Any]]:
-    """McNemar's test for every pair of different groups, on the starts they share."""
-    pairs = []
-    for i, (name_a, group_a, _, a) in enumerate(found):
-        for name_b, group_b, _, b in found[i + 1 :]:
-            if group_a != group_b and len(a.final) == len(b.final) and len(pairs) < 100:
-                pairs.append({"a": name_a, "b": name_b} | compare(a, b))
-    return pairs
-
-
-def tabulate(
-    rows: list[dict[str, Any]], groups: list[dict[str, Any]], pairs: list[dict[str, Any]]
-) -> None:
-    """The evaluation as a table on standard output."""
-    first, counts = rows[0], {row["episodes"] for row in rows}
-    title = f"{counts.pop()} fresh starts" if len(counts) == 1 else "fresh starts"
-    title += f"; success: all within {first['radius']:g} m at the last step"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("run", overflow="fold", min_width=16)
+    table.add_column("run", overflow="fold", min_width=10)
     percent = f"{100 * first['confidence']:g} %"
-    heads = "success", percent, "in 0.05", "median", "95 %", "settled"
-    for head in heads:
+    heads = ["success", percent, "rest", "stays", *["broken"] * ruled, "in .05"]
+    for head in [*heads, "median", "95 %", "m/s", "rad/s", "settled"]:
         table.add_column(head, justify="right", no_wrap=True)
-    number = lambda v, digits: "-" if v is None else f"{v:.{digits}f}"
-    several = len(rows) > len(groups)
-    for row in rows + (groups if several else []):
-        low, high = row["interval"]
-        table.add_row(
-            row.get("name") or f"all of {row['group']}",
-            f"{100 * row['success_rate']:.1f} %",
-            f"{100 * low:.1f}-{100 * high:.1f}",
-            f"{100 * row['radii'][0]['success_rate']:.1f} %",
-            number(row["final_distance"]["0.5"], 3),
-            number(row["final_distance"]["0.95"], 3),
-            number(row["settling_time"]["0.5"], 1),
-        )
+    several = [dict(t, name=f"{t['group']}: {t['about']}") for t in teams if len(t["seeds"]) > 1]
+    for row in rows + several:
+        table.add_row(*cells(row, ruled))
     console = Console()
+    console = Console(width=max(console.width, 96)) if ruled else console
     console.print(table)
-    console.print("median and 95 %: worst final distance (m); settled: median time (s)\n")
-    for pair in pairs:
+    console.print(
+        "success, rest (no agent above 0.1 m/s or 0.1 rad/s), stays (in every step until "
+        f"{1 + max(m.evaluation.beyond / m.game.horizon for m in found):g} horizons)"
+        + (", broken (episodes with a violation)" if ruled else "")
+        + ": % of the episodes; median and 95 %: worst final distance (m); m/s and rad/s: of the "
+        "fastest agent at the last step, median; settled: median time (s)\n",
+        highlight=False,
+    )
+    for team in teams:
+        console.print(f"{team['group']}: {groups.words(team)}", highlight=False, markup=False)
+    for row in rows:
+        if row["rests"] and row["rests"] != RESTS:
+            console.print(f"{row['name']}: {row['rests']}", highlight=False, markup=False)
+    for pair in result["comparisons"]:
         text = f"{pair['a']} against {pair['b']}: only the first {pair['only_a']}, "
         text += f"only the second {pair['only_b']}, McNemar p = {pair['p_value']:.2g}"
-        console.print(text, highlight=False)
+        console.print(text, highlight=False, markup=False)
+    if len(result["comparisons"]) == groups.MOST_PAIRS:
+        console.print(f"Only the first {groups.MOST_PAIRS} pairs are compared.", highlight=False)
+
+
+def cells(row: dict[str, Any], ruled: bool) -> list[str]:
+    """One line of the evaluation's table."""
+    number = lambda v, digits: "-" if v is None else f"{v:.{digits}f}"
+    share = lambda part: f"{100 * part['success_rate']:.1f}"
+    low, high = row["interval"]
+    return [
+        escape(row["name"]),
+        share(row),
+        f"{100 * low:.1f}-{100 * high:.1f}",
+        share(row["at_rest"]),
+        share(row["stayed"]) if row["beyond_steps"] else "-",
+        *[share(row["violations"])] * ruled,
+        share(row["radii"][0]),
+        number(row["final_distance"]["0.5"], 3),
+        number(row["final_distance"]["0.95"], 3),
+        number(row["final_speed"]["0.5"], 2),
+        number(row["final_spin"]["0.5"], 2),
+        number(row["settling_time"]["0.5"], 1),
+    ]
+
+
+def rules(game: AbstractGame) -> bool:
+    """Whether the game has rules that can be broken."""
+    return type(game).violations is not AbstractGame.violations
 
 
 SAMPLED = ("reach", "reach-and-stay", "decrease", "contraction", "basin", "quantiles")

@@ -63,6 +63,30 @@ def page(runs: Sequence[Run], episodes: int, seed: int, command: str = "") -> di
     }
 
 
+def progress(run: Run) -> tuple[int, int]:
+    """Environment steps done, by the log where the checkpoints are gone, and steps in all."""
+    steps = [line["steps"] for line in history(run)[0] if isinstance(line.get("steps"), int)]
+    whole = run.trainer.iterations * run.trainer.steps_per_iteration
+    return max([run.steps_done, *steps[-1:]]), whole
+
+
+def history(run: Run) -> tuple[list[dict[str, Any]], str]:
+    """The log of a run as far as it can be read, and in words what it lacks."""
+    try:
+        lines = run.history()
+    except UserError as error:
+        return [], f"log.jsonl cannot be read ({error})"
+    if not lines:
+        return [], "log.jsonl is missing, empty or cut off"
+    policy = run.directory / "policy"
+    logged, known = lines[-1].get("iteration", 0), 0
+    if policy.is_dir():
+        known = store.read(policy, "policy")[1].get("iteration", 0)
+    if logged < known:
+        return lines, f"log.jsonl ends at iteration {logged} of {known}"
+    return lines, ""
+
+
 def _row(run: Run, result: Evaluation) -> dict[str, Any]:
     summary = result.summary()
     within = [r | {"rate": r["success_rate"]} for r in summary["radii"]]

@@ -131,7 +131,7 @@ class Run:
 
     @property
     def title(self) -> str:
-        named = [self.names[k] for k in ("task", "algorithm") if k in self.names]
+        named = [self.names[k].rpartition(":")[2] for k in ("task", "algorithm") if k in self.names]
         return " ".join([*named, f"seed {self.seed}"])
 
     @property
