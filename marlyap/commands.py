@@ -29,7 +29,7 @@ from marlyap.evaluation import RESTS, evaluate
 from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import cost_sum
 from marlyap.recheck import recheck
-from marlyap.report import Film, Page, html
+from marlyap.report import MARK, Film, Page, html
 from marlyap.run import Run, expand
 from marlyap.seeds import stream
 from marlyap.tasks import TASKS
@@ -354,8 +354,12 @@ def report(args: Namespace, overrides: Overrides) -> Result:
     """Write the HTML page and the pictures."""
     game, algorithm = own_code(args, overrides)
     runs = [Run.open(d, game, algorithm) for d in expand(args.runs)]
-    out = args.out or runs[0].directory / "report.html"
-    page = film.page(runs, args.episodes, args.seed, command=shlex.join(["marlyap", *sys.argv[1:]]))
+    default = runs[0].directory / "report.html" if len(runs) == 1 else Path("report.html")
+    out = args.out or default
+    if out.exists() and not is_report(out):
+        raise UserError(f"out: {out} exists and is not a report of marlyap; choose another file.")
+    command = shlex.join(["marlyap", *sys.argv[1:]])
+    page = film.page(runs, args.episodes, starts_of(args.seed), command)
     store.write_text_atomic(out, html(cast(Page, page)))
     from marlyap import draw
 
@@ -363,8 +367,21 @@ def report(args: Namespace, overrides: Overrides) -> Result:
     draw.trajectories_png(page["films"], pictures[0])
     draw.learning_curves_png(page["runs"], pictures[1])
     say(f"Report: {out.resolve()}")
-    summary = {k: page["summary"][k] for k in ("episodes", "successes", "success_rate", "interval")}
-    return summary | {"report": str(out), "pictures": [str(p) for p in pictures]}, 0
+    for note in page["notes"]:
+        say(note)
+    result = {"start_seed": page["starts"], "groups": page["groups"]}
+    if len(page["groups"]) == 1:
+        result = {k: v for k, v in page["groups"][0].items() if k != "text"} | result
+    return result | {"report": str(out), "pictures": [str(p) for p in pictures]}, 0
+
+
+def is_report(path: Path) -> bool:
+    """Whether a file was written by `report`, and may be replaced by it."""
+    try:
+        with path.open("rb") as file:
+            return MARK.encode() in file.read(10_000_000)
+    except OSError as error:
+        raise UserError(f"out: {path} cannot be read ({error.strerror}).") from None
 
 
 def watch(args: Namespace, overrides: Overrides) -> Result:
@@ -374,16 +391,19 @@ def watch(args: Namespace, overrides: Overrides) -> Result:
     place = args.out or run.directory
     if not place.is_dir():
         raise UserError(f"out: there is no directory {place}.")
-    shot = film.one(run, args.episode, args.seed)
+    starts = starts_of(args.seed)
+    shot = film.one(run, args.episode, starts)
     from marlyap import draw
 
     gif, page = place / "film.gif", place / "film.html"
     draw.film_gif(cast(Film, shot), gif)
-    store.write_text_atomic(
-        page, html(cast(Page, {"title": f"One episode of {run.title}", "films": [shot]}))
-    )
+    title = f"One episode of {run.title}"
+    about = f"start {args.episode} of the held-out starts of seed {starts}"
+    text = html(cast(Page, {"title": title, "subtitle": about, "films": [shot]}))
+    store.write_text_atomic(page, text)
     say(f"Film: {page.resolve()} and {gif.resolve()}")
-    return {"gif": str(gif), "html": str(page), "success": bool(shot["success"])}, 0
+    done = {"gif": str(gif), "html": str(page), "start_seed": starts}
+    return done | {"success": bool(shot["success"])}, 0
 
 
 def listing(args: Namespace, overrides: Overrides) -> Result:
@@ -491,10 +511,9 @@ def demo(args: Namespace, overrides: Overrides) -> Result:
         Namespace(runs=names, out=out, episodes=500, seed=0, task=None, algorithm=None), {}
     )
     assert result is not None
-    low, high = (100 * end for end in result["interval"])
-    rate, seconds = 100 * result["success_rate"], time.monotonic() - start
-    text = f"{result['successes']} of {result['episodes']} fresh starts succeeded: {rate:.1f} % "
-    text += f"(95 % interval {low:.1f} to {high:.1f} %), in {seconds:.0f} s."
+    rests = f"; the team {result['rests']}" if result["rests"] else ""
+    text = f"{result['successes']} of {result['episodes']} held-out starts of seed 0 succeeded: "
+    text += f"{groups.words(result)}{rests}. It took {time.monotonic() - start:.0f} s."
     print(text, file=sys.stderr if args.json else sys.stdout)
     return result | {"seconds": time.monotonic() - start}, 0
 

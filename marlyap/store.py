@@ -214,8 +214,13 @@ def lock(directory: Path) -> Iterator[None]:
 
 def write_text_atomic(path: Path, text: str) -> None:
     """Replace the file by `text`; at every instant the old or the new one is there, whole."""
+    write_bytes_atomic(path, text.encode())
+
+
+def write_bytes_atomic(path: Path, data: bytes) -> None:
+    """Replace the file by `data`; at every instant the old or the new one is there, whole."""
     with _beside(path) as scratch:
-        _write_file(scratch, [text.encode()])
+        _write_file(scratch, [data])
         os.replace(scratch, path)
         _sync(path.parent)
 
