@@ -31,6 +31,7 @@ from marlyap.recheck import recheck
 from marlyap.report import Film, Page, html
 from marlyap.run import Run, expand
 from marlyap.seeds import stream
+from marlyap.subject import changed
 from marlyap.tasks import TASKS
 from marlyap.trainer import Trainer, schedule_for
 from marlyap.workers import train_all
@@ -85,12 +86,7 @@ def assemble(args: Namespace, overrides: Overrides) -> Trainer:
     algorithm = PRESETS[preset](config.load(args.algorithm, AbstractAlgorithm))
     schedule = schedule_for(algorithm, preset)
     parts = {"task": game, "algorithm": algorithm, "schedule": schedule}
-    for path, text in overrides.items():
-        part, _, field = path.partition(".")
-        try:
-            parts[part] = config.override(parts[part], field, text)
-        except UserError as error:
-            raise UserError(f"--{part}.{error}") from None
+    parts = config.override_all(parts, overrides)
     if args.steps is not None:
         parts["schedule"] = config.override(parts["schedule"], "steps", str(args.steps))
     return Trainer(parts["task"], parts["algorithm"], parts["schedule"])
@@ -108,19 +104,6 @@ def own_code(
             raise UserError(f"--{path}: here only --task.FIELD beside --task can be set.")
         game = config.override(game, field, text)
     return game, algorithm
-
-
-def changed(game: AbstractGame, overrides: Overrides) -> AbstractGame:
-    """The task of a run with some fields set anew: what its policy was not trained on."""
-    for path, text in overrides.items():
-        part, _, field = path.partition(".")
-        if part != "task":
-            raise UserError(f"--{path}: the policy is trained; only fields of the task can be set.")
-        try:
-            game = config.override(game, field, text)
-        except UserError as error:
-            raise UserError(f"--task.{error}") from None
-    return game
 
 
 def seeds(words: list[str]) -> list[int]:
