@@ -18,9 +18,54 @@ OVERRIDES = """
 any field of the task, the algorithm and the schedule can be set by its dotted name:
   --task.agents 5 --task.graph path --task.dynamics.limits 2,2
   --algorithm.rate_Q 1e-3 --algorithm.constraint.reading hinge --schedule.environments 16
-`marlyap list TASK` and `marlyap list ALGORITHM` show the fields and their values.
+`marlyap list TASK`, `marlyap list ALGORITHM` and `marlyap list schedule` show the fields.
 TASK and ALGORITHM may also be path/to/file.py:Name, code of your own.
 """
+ON_TASK = """
+any field of the task can be set by its dotted name; `marlyap list TASK` shows them:
+  --task.agents 5 --task.graph path --task.dynamics.limits 2,2
+"""
+SUBJECT = (
+    ON_TASK
+    + """
+without --task a policy is measured on the task it was trained on. A run whose task is your own
+code needs --task path/to/file.py:Name for that code. Any other task is measured if the policy fits.
+"""
+)
+EXAMPLES = {
+    "demo": """
+  marlyap demo
+  marlyap demo --seeds 0 1 2 --out runs/three""",
+    "train": """
+  marlyap train rendezvous masac-lyapunov
+  marlyap train formation masac --seeds 0 1 2 --steps 100000 --task.agents 5
+  marlyap train platoon.py:Platoon apg
+  marlyap train --resume runs/rendezvous/masac-lyapunov/seed0""",
+    "evaluate": """
+  marlyap evaluate runs/demo
+  marlyap evaluate runs/demo/seed0 --task rendezvous-late
+  marlyap evaluate runs/demo/seed0 pursuit --task rendezvous --task.size 2""",
+    "certify": """
+  marlyap certify runs/demo/seed0
+  marlyap certify runs/demo/seed0 --certificates reach --task.size 2 --out certificate
+  marlyap certify pursuit --task rendezvous --out certificate""",
+    "recheck": """
+  marlyap recheck runs/demo/seed0/certificate""",
+    "check-task": """
+  marlyap check-task formation
+  marlyap check-task platoon.py:Platoon --task.agents 8""",
+    "report": """
+  marlyap report runs/demo
+  marlyap report runs/demo/seed0 --task rendezvous-late --out late.html""",
+    "watch": """
+  marlyap watch runs/demo/seed0 --episode 3
+  marlyap watch runs/demo/seed0 --task.size 2 --out films""",
+    "list": """
+  marlyap list
+  marlyap list rendezvous
+  marlyap list masac-lyapunov
+  marlyap list platoon.py:Platoon""",
+}
 
 
 SEED = "of the starts (default 0), or the word draw for starts that nobody has seen"
@@ -56,7 +101,7 @@ def parser() -> Parser:
             name,
             help=help,
             description=help[0].upper() + help[1:] + ".",
-            epilog=epilog,
+            epilog=f"{epilog}\nexamples:{EXAMPLES[name]}".lstrip(),
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
@@ -64,6 +109,12 @@ def parser() -> Parser:
             "--json", action="store_true", help="print one JSON object on standard output"
         )
         return p
+
+    def on(p: Parser, task: str) -> None:
+        p.add_argument("--task", default=None, help=task)
+        p.add_argument(
+            "--algorithm", default=None, help="the algorithm of a run where it is your own code"
+        )
 
     p = verb("demo", "train, evaluate and report the main task, from nothing to a film")
     p.add_argument("--out", type=Path, default=Path("runs/demo"), help="directory of the runs")
@@ -90,19 +141,17 @@ def parser() -> Parser:
     )
     p.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
 
-    p = verb("evaluate", "measure runs or hand-written controllers on held-out starts", OVERRIDES)
+    p = verb("evaluate", "measure runs or hand-written controllers on held-out starts", SUBJECT)
     p.add_argument("runs", nargs="+", metavar="RUN", help="run directories or controller names")
-    p.add_argument("--task", default=None, help="the task, for controllers or tasks of your own")
-    p.add_argument("--algorithm", default=None, help="the algorithm, where it is your own code")
+    on(p, "the task to measure on (default: that of each run; needed for controllers)")
     p.add_argument("--episodes", type=int, default=500, help="held-out starts (default 500)")
     p.add_argument("--seed", type=seed_of_starts, default=0, help=SEED)
     p.add_argument("--confidence", type=float, default=0.95, help="of the intervals")
     p.add_argument("--out", type=Path, default=None, help="file for the figures, as JSON")
 
-    p = verb("certify", "say what holds of a run or controller, with what evidence", OVERRIDES)
+    p = verb("certify", "say what holds of a run or controller, with what evidence", SUBJECT)
     p.add_argument("run", metavar="RUN", help="a run directory or a controller name")
-    p.add_argument("--task", default=None, help="the task, for controllers or tasks of your own")
-    p.add_argument("--algorithm", default=None, help="the algorithm, where it is your own code")
+    on(p, "the task to measure on (default: that of each run; needed for controllers)")
     p.add_argument("--certificates", nargs="+", default=None, help="names (default: the sampled)")
     each = "fresh starts of each (default 10000; robustness 2000, theorem1 and composition 5000)"
     p.add_argument("--rollouts", type=int, default=None, help=each)
@@ -114,28 +163,26 @@ def parser() -> Parser:
     p = verb("recheck", "derive every figure of a certificate again, without JAX")
     p.add_argument("certificate", type=Path, metavar="CERTIFICATE", help="what certify wrote")
 
-    p = verb("check-task", "hold a task against the laws that all else relies on", OVERRIDES)
+    p = verb("check-task", "hold a task against the laws that all else relies on", ON_TASK)
     p.add_argument("task", metavar="TASK", help="a name of `marlyap list`, or path/to/file.py:Name")
     p.add_argument("--seed", type=int, default=0, help="of the episodes looked at (default 0)")
 
-    p = verb("report", "write one HTML file (and PNGs) about runs")
+    p = verb("report", "write one HTML file (and PNGs) about runs", SUBJECT)
     p.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run directories")
     place = "HTML file (default: in the run; of several runs, ./report.html)"
     p.add_argument("--out", type=Path, default=None, help=place)
     p.add_argument("--episodes", type=int, default=500, help="held-out starts (default 500)")
     p.add_argument("--seed", type=seed_of_starts, default=0, help=SEED)
-    p.add_argument("--task", default=None, help="the task, where it is your own code")
-    p.add_argument("--algorithm", default=None, help="the algorithm, where it is your own code")
+    on(p, "the task to measure on (default: that of each run)")
 
-    p = verb("watch", "film one episode of a run, as GIF and HTML")
+    p = verb("watch", "film one episode of a run, as GIF and HTML", SUBJECT)
     p.add_argument("run", type=Path, metavar="RUN", help="a run directory")
     p.add_argument("--episode", type=int, default=0, help="which of the evaluation starts")
     p.add_argument("--seed", type=seed_of_starts, default=0, help=SEED)
     p.add_argument(
         "--out", type=Path, default=None, help="where to put the film (default: the run)"
     )
-    p.add_argument("--task", default=None, help="the task, where it is your own code")
-    p.add_argument("--algorithm", default=None, help="the algorithm, where it is your own code")
+    on(p, "the task to measure on (default: that of each run)")
 
     p = verb("list", "list tasks, algorithms and controllers, or the fields of one")
     p.add_argument("name", nargs="?", help="a task or an algorithm: shows its fields")

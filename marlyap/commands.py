@@ -32,6 +32,7 @@ from marlyap.recheck import recheck
 from marlyap.report import MARK, Film, Page, html
 from marlyap.run import Run, expand
 from marlyap.seeds import stream
+from marlyap.subject import asked, refuse_all_but_task, subject
 from marlyap.tasks import TASKS
 from marlyap.trainer import Trainer, schedule_for
 from marlyap.workers import train_all
@@ -86,12 +87,7 @@ def assemble(args: Namespace, overrides: Overrides) -> Trainer:
     algorithm = PRESETS[preset](config.load(args.algorithm, AbstractAlgorithm))
     schedule = schedule_for(algorithm, preset)
     parts = {"task": game, "algorithm": algorithm, "schedule": schedule}
-    for path, text in overrides.items():
-        part, _, field = path.partition(".")
-        try:
-            parts[part] = config.override(parts[part], field, text)
-        except UserError as error:
-            raise UserError(f"--{part}.{error}") from None
+    parts = config.override_all(parts, overrides)
     if args.steps is not None:
         parts["schedule"] = config.override(parts["schedule"], "steps", str(args.steps))
     return Trainer(parts["task"], parts["algorithm"], parts["schedule"])
@@ -109,19 +105,6 @@ def own_code(
             raise UserError(f"--{path}: here only --task.FIELD beside --task can be set.")
         game = config.override(game, field, text)
     return game, algorithm
-
-
-def changed(game: AbstractGame, overrides: Overrides) -> AbstractGame:
-    """The task of a run with some fields set anew: what its policy was not trained on."""
-    for path, text in overrides.items():
-        part, _, field = path.partition(".")
-        if part != "task":
-            raise UserError(f"--{path}: the policy is trained; only fields of the task can be set.")
-        try:
-            game = config.override(game, field, text)
-        except UserError as error:
-            raise UserError(f"--task.{error}") from None
-    return game
 
 
 def seeds(words: list[str]) -> list[int]:
@@ -144,7 +127,8 @@ def measure(args: Namespace, overrides: Overrides) -> Result:
     if args.out is not None and not args.out.parent.is_dir():
         raise UserError(f"out: there is no directory {args.out.parent}.")
     starts = starts_of(args.seed)
-    game, algorithm = own_code(args, overrides if args.task else {})
+    refuse_all_but_task(overrides)
+    game = asked(args.task, overrides) if args.task else None
     found: list[groups.Measured] = []
     directories = []
     for word in args.runs:
@@ -160,11 +144,10 @@ def measure(args: Namespace, overrides: Overrides) -> Result:
             raise UserError(f"run: there is no run or controller '{word}'; {hint}")
     notes = []
     for directory in expand(directories):
-        run = Run.open(directory, game, algorithm)
-        there = changed(run.game, overrides)
-        controller = run.controller(there) if overrides else run.controller()
-        result = evaluate(there, controller, args.episodes, starts)
-        found.append(groups.of_run(run, result, starts, there))
+        run, there = subject(directory, args.task, args.algorithm, overrides)
+        notes += run.warnings
+        result = evaluate(there, run.controller(there), args.episodes, starts)
+        found.append(groups.of_run(run, result, starts, there, args.task or ""))
         done, whole = film.progress(run)
         if done < whole:
             notes.append(f"{directory}: training is unfinished ({done} of {whole} steps).")
@@ -220,7 +203,11 @@ def tabulate(result: dict[str, Any], found: Sequence[groups.Measured]) -> None:
     title = f"{first['episodes']} held-out starts of seed {result['start_seed']}; "
     title += f"success: all within {near} at the last step"
     table = Table(
-        title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True
+        title=title,
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        collapse_padding=True,
     )
     table.add_column("run", overflow="fold", min_width=10)
     percent = f"{100 * first['confidence']:g} %"
@@ -352,14 +339,14 @@ def check_task(args: Namespace, overrides: Overrides) -> Result:
 
 def report(args: Namespace, overrides: Overrides) -> Result:
     """Write the HTML page and the pictures."""
-    game, algorithm = own_code(args, overrides)
-    runs = [Run.open(d, game, algorithm) for d in expand(args.runs)]
+    opened = [subject(d, args.task, args.algorithm, overrides) for d in expand(args.runs)]
+    runs = [run for run, _ in opened]
     default = runs[0].directory / "report.html" if len(runs) == 1 else Path("report.html")
     out = args.out or default
     if out.exists() and not is_report(out):
         raise UserError(f"out: {out} exists and is not a report of marlyap; choose another file.")
     command = shlex.join(["marlyap", *sys.argv[1:]])
-    page = film.page(runs, args.episodes, starts_of(args.seed), command)
+    page = film.page(opened, args.episodes, starts_of(args.seed), command, args.task or "")
     store.write_text_atomic(out, html(cast(Page, page)))
     from marlyap import draw
 
@@ -386,19 +373,20 @@ def is_report(path: Path) -> bool:
 
 def watch(args: Namespace, overrides: Overrides) -> Result:
     """Film one episode."""
-    game, algorithm = own_code(args, overrides)
-    run = Run.open(expand([args.run])[0], game, algorithm)
+    run, game = subject(expand([args.run])[0], args.task, args.algorithm, overrides)
     place = args.out or run.directory
     if not place.is_dir():
         raise UserError(f"out: there is no directory {place}.")
     starts = starts_of(args.seed)
-    shot = film.one(run, args.episode, starts)
+    shot = film.one(run, args.episode, starts, game=game)
     from marlyap import draw
 
     gif, page = place / "film.gif", place / "film.html"
     draw.film_gif(cast(Film, shot), gif)
     title = f"One episode of {run.title}"
     about = f"start {args.episode} of the held-out starts of seed {starts}"
+    if game is not run.game:
+        about += f", on {groups.told(run.game, game, args.task or '')}"
     text = html(cast(Page, {"title": title, "subtitle": about, "films": [shot]}))
     store.write_text_atomic(page, text)
     say(f"Film: {page.resolve()} and {gif.resolve()}")

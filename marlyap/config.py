@@ -39,6 +39,10 @@ FAMILIES: dict[type, dict[str, Any]] = {
 WORDS = {AbstractGame: "task", AbstractAlgorithm: "algorithm"}
 
 
+class UnknownCode(UserError):
+    """A record names a class that is neither marlyap's nor named by the user."""
+
+
 def known() -> dict[str, type]:
     """The classes that a record may name without anyone's leave."""
     members = [type(o) for family in FAMILIES.values() for o in family.values()]
@@ -79,6 +83,21 @@ def override(obj: T, path: str, text: str) -> T:
     return _override(obj, path.split("."), text, path)
 
 
+def override_all(parts: Mapping[str, Any], texts: Mapping[str, str]) -> dict[str, Any]:
+    """The parts with every `part.field` set; an object is chosen before its fields are set.
+
+    Raises UserError as `override` does, the option's full name before it.
+    """
+    changed = dict(parts)
+    for path in sorted(texts, key=lambda path: path.count(".")):
+        part, _, field = path.partition(".")
+        try:
+            changed[part] = override(changed[part], field, texts[path])
+        except UserError as error:
+            raise UserError(f"--{part}.{error}") from None
+    return changed
+
+
 def fields(obj: Any) -> dict[str, Any]:
     """The configuration of an object: its fields by name."""
     return {f.name: getattr(obj, f.name) for f in dataclasses.fields(obj) if f.init}
@@ -91,16 +110,67 @@ def record(obj: Any) -> Any:
     return [record(v) for v in obj] if isinstance(obj, tuple) else obj
 
 
+def own_classes(obj: Any) -> dict[str, type]:
+    """The classes in an object and its fields that are not marlyap's, outermost first."""
+    found: dict[str, type] = {}
+    if isinstance(obj, eqx.Module):
+        if not _ours(type(obj)):
+            found[type(obj).__name__] = type(obj)
+        obj = tuple(fields(obj).values())
+    if isinstance(obj, tuple):
+        for value in obj:
+            found |= own_classes(value)
+    return found
+
+
+def named_by(obj: Any) -> dict[str, type]:
+    """The user's classes that may be built once he has named this object.
+
+    Those in its fields, and every module class that the files defining them define or import.
+    """
+    used = own_classes(obj)
+    modules = [sys.modules.get(cls.__module__) for cls in used.values()]
+    beside = {
+        value.__name__: value
+        for module in modules
+        for value in vars(module).values()
+        if inspect.isclass(value) and issubclass(value, eqx.Module) and not _ours(value)
+    }
+    return beside | used
+
+
+def code_of(obj: Any, typed: str) -> dict[str, Any] | None:
+    """The user's code in this object: its file, what was in it, its classes; None for ours.
+
+    `typed` is what the object was called: `file` is the file as it was typed there, `source` where
+    it lies.
+    """
+    used = own_classes(obj)
+    if not used:
+        return None
+    path = _file(next(iter(used.values())))
+    file = typed.rpartition(":")[0] or (path.name if path else None)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest() if path else None
+    return {"file": file, "sha256": digest, "classes": list(used), "source": path}
+
+
+def _ours(cls: type) -> bool:
+    return cls.__module__.partition(".")[0] in ("marlyap", "equinox")
+
+
+def _file(cls: type) -> Path | None:
+    """The source file of a class; None where there is none, as in a notebook."""
+    name = getattr(sys.modules.get(cls.__module__), "__file__", None)
+    return Path(name) if name and Path(name).is_file() else None
+
+
 def build(data: Any, allowed: Mapping[str, type], where: str) -> Any:
     """The object that `record` wrote. Raises UserError for anything it would not have written."""
     if not isinstance(data, dict) or not isinstance(data.get("kind"), str):
         raise UserError(f"{where}: expected an object with a 'kind'; the file may be damaged.")
     cls = allowed.get(data["kind"])
     if cls is None:
-        raise UserError(
-            f"{where}: '{data['kind']}' is not part of marlyap; if it is your own code, name it "
-            f"with --{where.split('.')[0]} path/to/file.py:{data['kind']}."
-        )
+        raise UnknownCode(f"{where}: '{data['kind']}' is not part of marlyap")
     hints, values = _hints(cls), {}
     for name, value in data.items():
         if name == "kind":
@@ -255,7 +325,10 @@ def _comments(cls: type) -> dict[str, str]:
 def _module(path: Path, word: str) -> types.ModuleType:
     if not path.is_file():
         raise UserError(f"{word}: there is no file {path}.")
-    name = f"marlyap_user_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]}"
+    made_of = str(path.resolve()).encode() + b"\0" + path.read_bytes()
+    name = f"marlyap_user_{hashlib.sha256(made_of).hexdigest()[:12]}"
+    if name in sys.modules:  # a class must stay the same class when it is named again
+        return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise UserError(f"{word}: {path} is not a Python file.")
@@ -263,8 +336,9 @@ def _module(path: Path, word: str) -> types.ModuleType:
     sys.modules[name] = module  # where typing and inspect look for it
     try:
         spec.loader.exec_module(module)
-    except UserError:
-        raise
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
+        del sys.modules[name]
+        if isinstance(error, UserError) or not isinstance(error, (Exception, SystemExit)):
+            raise
         raise UserError(f"{word}: {path} could not be loaded: {error}.") from error
     return module

@@ -7,7 +7,6 @@ strip beneath and in vermilion where it rises.
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -135,9 +134,7 @@ def _quiet(axes: Any) -> None:
 
 
 def _save(figure: Any, path: str | Path) -> None:
-    data = io.BytesIO()
-    figure.savefig(data, format="png")
-    write_bytes_atomic(Path(path), data.getvalue())
+    write_bytes_atomic(Path(path), lambda file: figure.savefig(file, format="png"))
 
 
 # -------------------------------------------------------------------------------------------------
@@ -177,17 +174,9 @@ def _write_gif(panes: Sequence[_Pane], path: str | Path, fps: float | int) -> No
     palette.putpalette([channel for colour in _inks() for channel in colour])
     small = [frame.quantize(palette=palette, dither=0) for frame in frames]
     pause = [round(1000 / fps)] * (len(small) - 1) + [1500]
-    data = io.BytesIO()
-    small[0].save(
-        data,
-        format="GIF",
-        save_all=True,
-        append_images=small[1:],
-        duration=pause,
-        loop=0,
-        disposal=1,
-    )
-    write_bytes_atomic(Path(path), data.getvalue())
+    options = {"duration": pause, "loop": 0, "disposal": 1, "append_images": small[1:]}
+    save = lambda file: small[0].save(file, format="GIF", save_all=True, **options)
+    write_bytes_atomic(Path(path), save)
 
 
 def _inks() -> list[tuple[int, int, int]]:

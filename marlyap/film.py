@@ -31,65 +31,71 @@ MOST_COMPARED = 12
 
 
 def page(
-    runs: Sequence[Run],
+    opened: Sequence[tuple[Run, AbstractGame]],
     episodes: int,
     seed: int,
     command: str = "",
-    game: Callable[[Run], AbstractGame] = lambda run: run.game,
     called: str = "",
 ) -> dict[str, Any]:
-    """Everything that `report.html` draws of these runs, each measured on `game` of it.
+    """Everything that `report.html` draws of these runs, each measured on the game beside it.
 
-    `called` is the name of that game where it is not the one that the runs were trained on.
+    `called` is the name of that game where it is not the one that a run was trained on.
     """
-    found, teams = [], []
-    for run in runs:
-        result = evaluate(game(run), run.controller(game(run)), episodes, seed)
-        found.append(groups.of_run(run, result, seed, game(run), called))
-    by_name = groups.grouped(found)
-    labels = dict(zip(map(id, found), groups.labels(found), strict=True))
-    of = dict(zip(map(id, found), runs, strict=True))
-    teams = [{"label": n} | groups.summary(members) for n, members in by_name.items()]
-    certified = [certificates(of[id(m)], m.game, labels[id(m)]) for m in found]
+    runs = [run for run, _ in opened]
+    found = []
+    for run, game in opened:
+        result = evaluate(game, run.controller(game), episodes, seed)
+        found.append(groups.of_run(run, result, seed, game, called))
+    names, labels = groups.labels(found, brief=True)
+    team_of = dict(zip(names, groups.grouped(found).values(), strict=True))
+    of = {m.name: (run, label) for m, run, label in zip(found, runs, labels, strict=True)}
+    teams = [{"label": n} | groups.summary(members) for n, members in team_of.items()]
+    alone = len(runs) == 1
+    whose = lambda m: "" if alone else of[m.name][1]
+    certified = [certificates(of[m.name][0], m.game, whose(m)) for m in found]
     shown = [claim for c in certified for claim in c["certificates"]]
-    leads = [members[0] for members in by_name.values()][:MOST_FILMED]
-    filmed = [
-        shot
-        for m in leads
-        for shot in films(of[id(m)], m, "" if len(runs) == 1 else labels[id(m)])
+    leads = [members[0] for members in team_of.values()][:MOST_FILMED]
+    filmed = [shot for m in leads for shot in films(of[m.name][0], m, whose(m))]
+    pairs = [p | {k: of[p[k]][1] for k in "ab"} for p in groups.comparisons(found)]
+    apart = groups.differing([members[0].configuration for members in team_of.values()])
+    notes = [
+        note
+        for m, c in zip(found, certified, strict=True)
+        for note in (*_missing(of[m.name][0]), *c["notes"])
     ]
-    named = {m.name: labels[id(m)] for m in found}
-    pairs = [p | {k: named[p[k]] for k in "ab"} for p in groups.comparisons(found)]
-    shared = common([m.configuration for m in found])
     return {
-        "title": _title(runs, teams),
+        "title": _title(runs, found),
         "subtitle": _subtitle(found, teams),
         "generated": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
         "starts": seed,
-        "groups": [t | {"text": _caveat(t, bool(shown)), "success": groups.words(t)} for t in teams],
-        "runs": [_row(of[id(m)], m, labels[id(m)], name) for name, ms in by_name.items() for m in ms],
+        "groups": [t | {"text": _caveat(t, bool(shown))} for t in teams],
+        "runs": [
+            _row(of[m.name][0], m, of[m.name][1], name)
+            for name, members in team_of.items()
+            for m in members
+        ],
         "films": [*filmed, *(shot for c in certified for shot in c["films"])],
         "comparisons": pairs[:MOST_COMPARED],
         "certificates": shown,
         "slices": [part for c in certified for part in c["slices"]],
-        "notes": [note for m, c in zip(found, certified, strict=True)
-                  for note in (*_missing(of[id(m)], labels[id(m)]), *c["notes"])],
-        "config": shared,
+        "notes": notes,
+        "config": common([m.configuration for m in found]),
         "changed": sorted({name for run in runs for name in changed_fields(run)}),
         "differing": [
-            {"name": name, "fields": groups.differing([m[0].configuration for m in by_name.values()])[k]}
-            for k, name in enumerate(by_name)
-        ] if len(by_name) > 1 else [],
-        "training": [_training(run, labels[id(m)]) for m, run in zip(found, runs, strict=True)],
+            {"name": name, "fields": fields}
+            for name, fields in zip(team_of, apart, strict=True)
+            if len(team_of) > 1
+        ],
+        "training": [_training(run, label) for run, label in of.values()],
         "versions": store.versions(),
         "command": command,
     }
 
 
-def _title(runs: Sequence[Run], teams: Sequence[Mapping[str, Any]]) -> str:
-    if len(teams) == 1:
-        return str(teams[0]["label"])
-    names = lambda part: sorted({groups.short(run.names[part]) for run in runs})
+def _title(runs: Sequence[Run], found: Sequence[groups.Measured]) -> str:
+    if len(bases := {m.base for m in found}) == 1:
+        return bases.pop()
+    names = lambda part: sorted({run.labels[part] for run in runs})
     return f"{' and '.join(names('task'))}: {', '.join(names('algorithm'))}"
 
 
@@ -109,16 +115,19 @@ def _caveat(team: Mapping[str, Any], certified: bool) -> str:
     if not one:
         what = "the expected success rate of a policy that is trained with a new seed,"
     more = "What is certified, and on what evidence, stands below."
-    return MEASURED.format(what=what, more=more if certified else "Stability is not certified by it.")
+    return MEASURED.format(
+        what=what, more=more if certified else "Stability is not certified by it."
+    )
 
 
-def _missing(run: Run, label: str) -> list[str]:
+def _missing(run: Run) -> list[str]:
     """What a report of this run has to do without."""
     why, (done, whole) = history(run)[1], progress(run)
-    lacks = [f"{label}: learning curves are missing or cut short, for {why}."] if why else []
+    place = run.directory
+    lacks = [f"{place}: learning curves are missing or cut short: {why}."] if why else []
     if done < whole:
-        lacks.append(f"{label}: training is unfinished ({done} of {whole} steps).")
-    return lacks
+        lacks.append(f"{place}: training is unfinished ({done} of {whole} steps).")
+    return [*run.warnings, *lacks]
 
 
 def common(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -300,12 +309,13 @@ def certificates(run: Run, game: AbstractGame, label: str) -> dict[str, list[Any
     try:
         _, meta = store.read(place, "certificate")
     except UserError as error:
-        shown["notes"].append(f"{label}: its certificate is left out: {error}")
+        shown["notes"].append(f"{run.directory}: its certificate is left out: {error}")
         return shown
     other = "policy" * (meta["policy"] != policy_hash(run.controller()))
     if other or meta["game"] != plain(game):
         shown["notes"].append(
-            f"{label}: its certificate is left out, because it is of another {other or 'game'}."
+            f"{run.directory}: its certificate is left out, because it is of another "
+            f"{other or 'game'}."
         )
         return shown
     V = None

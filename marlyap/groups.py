@@ -42,11 +42,6 @@ class Measured:
         return json.dumps([self.base, self.configuration], sort_keys=True, default=str)
 
 
-def short(name: str) -> str:
-    """A task's or algorithm's name without the path of the file that it is from."""
-    return name.rpartition(":")[2]
-
-
 def of_run(
     run: Run,
     evaluation: Evaluation,
@@ -59,15 +54,20 @@ def of_run(
     trained = {"task": run.game, "algorithm": run.trainer.algorithm}
     trained |= {"schedule": run.trainer.schedule}
     configuration = {part: record(value) for part, value in trained.items()}
-    base = f"{short(run.names['task'])} {short(run.names['algorithm'])}"
+    base = f"{run.labels['task']} {run.labels['algorithm']}"
     if run.names.get("preset", "") not in ("", "tuned"):
         base += f" ({run.names['preset']})"
     if not same_game(asked, run.game):
         configuration["measured on"] = record(asked)
-        told = short(called) or differing([configuration["task"], record(asked)])[1]
-        base += f" measured on {told or type(asked).__name__}"
+        base += f" measured on {told(run.game, asked, called)}"
     place = str(run.directory)
     return Measured(place, base, configuration, asked, starts, evaluation, run.seed)
+
+
+def told(trained: AbstractGame, asked: AbstractGame, called: str = "") -> str:
+    """A game in words for whom knows the trained one: its name, if it has one, or what differs."""
+    fields = differing([record(trained), record(asked)])[1]
+    return called.rpartition(":")[2] or fields or type(asked).__name__
 
 
 def of_controller(name: str, game: AbstractGame, evaluation: Evaluation, starts: int) -> Measured:
@@ -93,8 +93,8 @@ def grouped(found: Sequence[Measured]) -> dict[str, list[Measured]]:
         base = members[0].base
         alike = [g[0].configuration for g in groups.values() if g[0].base == base]
         mine = alike.index(members[0].configuration)
-        told = differing(alike)[mine]
-        named[f"{base} ({told})" if told else base] = members
+        apart = differing(alike)[mine]
+        named[f"{base} ({apart})" if apart else base] = members
     return named
 
 
@@ -132,15 +132,24 @@ def _shown(value: Any) -> str:
     return "none" if value is None else f"{value:g}" if type(value) is float else str(value)
 
 
-def labels(found: Sequence[Measured]) -> list[str]:
-    """What to call each of them so that no two are called the same."""
-    names = {id(m): name for name, members in grouped(found).items() for m in members}
-    said = lambda m: names[id(m)] + ("" if m.seed is None else f", seed {m.seed}")
+def labels(found: Sequence[Measured], brief: bool = False) -> tuple[list[str], list[str]]:
+    """What to call the groups, and each of the runs so that no two are called the same.
+
+    `brief` leaves out what all of them have in common.
+    """
+    teams = grouped(found)
+    names, bases = dict(zip(teams, teams, strict=True)), {m.base for m in found}
+    if brief and len(teams) > 1 and len(bases) == 1:
+        base = bases.pop()
+        names = {name: name.removeprefix(f"{base} (").removesuffix(")") for name in teams}
+    team = {id(m): names[name] for name, members in teams.items() for m in members}
+    said = lambda m: team[id(m)] + ("" if m.seed is None else f", seed {m.seed}")
     first = [said(m) for m in found]
-    return [
+    each = [
         f"{label} ({m.name})" if first.count(label) > 1 else label
         for m, label in zip(found, first, strict=True)
     ]
+    return list(names.values()), each
 
 
 def summary(members: Sequence[Measured], confidence: float = 0.95) -> dict[str, Any]:

@@ -428,7 +428,10 @@ def _claim(c: Certificate, several: bool) -> str:
     """One claim: what was asked, what was shown, and whether that is enough."""
     holds, asked, shown = c.get("holds"), _number(c.get("asked")), _number(c.get("bound"))
     share = asked is not None and shown is not None and holds == (shown >= asked)
-    words = {True: "reached" if share else "holds", False: "not reached" if share else "does not hold"}
+    words = {
+        True: "reached" if share else "holds",
+        False: "not reached" if share else "does not hold",
+    }
     kind = "holds" if holds else "fails"
     verdict = "" if holds is None else _tag("span", words[holds], cls=f"mark {kind}")
     head = _tag("h3", _of(c.get("name") or "claim", c, several) + verdict)

@@ -41,6 +41,7 @@ class Run:
     trainer: Trainer
     seed: int
     names: dict[str, str]  # what the task and the algorithm were called
+    warnings: tuple[str, ...] = ()  # what to tell whoever opens it
 
     @classmethod
     def create(
@@ -56,6 +57,10 @@ class Run:
         if directory.exists():
             with store.lock(directory):  # not while another process trains in it
                 shutil.rmtree(directory)
+        parts = {"task": trainer.game, "algorithm": trainer.algorithm}
+        made_of = {k: config.code_of(part, names.get(k, "")) for k, part in parts.items()}
+        wanted = ("file", "sha256", "classes")  # of the user's own code alone
+        code = {k: {w: found[w] for w in wanted} for k, found in made_of.items() if found}
         about = {
             "schema": SCHEMA,
             "task": config.record(trainer.game),
@@ -63,6 +68,7 @@ class Run:
             "schedule": config.record(trainer.schedule),
             "seed": seed,
             "names": names,
+            "code": code,
             "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             "versions": store.versions(),
         }
@@ -114,24 +120,44 @@ class Run:
         if type(about["seed"]) is not int or not isinstance(about["names"], dict):
             raise UserError(f"run: {where} has a seed or names of the wrong kind.")
         seeds.check(about["seed"])
-        own = {type(o).__name__: type(o) for o in (game, algorithm) if o is not None}
-        parts = [
-            config.build(about[part], config.known() | own, part)
-            for part in ("task", "algorithm", "schedule")
-        ]
+        names = {k: str(about["names"].get(k, "")) for k in ("task", "algorithm", "preset")}
+        named = {"task": config.named_by(game), "algorithm": config.named_by(algorithm)}
+        everything = named["algorithm"] | named["task"]
+        parts, warnings = [], []
+        for part in ("task", "algorithm", "schedule"):
+            own, typed = everything | named.get(part, {}), names.get(part, "")
+            code = _recorded(about.get("code"), part, where, own)
+            allowed = {k: v for k, v in config.known().items() if k not in code["classes"]}
+            allowed |= {k: v for k, v in own.items() if k in code["classes"]}
+            try:
+                made = config.build(about[part], allowed, part)
+            except config.UnknownCode as error:
+                file = typed if ":" in typed else f"path/to/file.py:{about[part]['kind']}"
+                raise UserError(
+                    f"{error}; if it is your own code, name it with --{part} {file}."
+                ) from None
+            now = config.code_of(made, typed)
+            if now and code["sha256"] not in (None, now["sha256"]):
+                what = f"the code in {now['source']} is not what {directory} was trained with"
+                warnings.append(f"{part}: {what}; it has changed since.")
+            parts.append(made)
         for part, family in zip(parts, (AbstractGame, AbstractAlgorithm, Schedule), strict=True):
             if not isinstance(part, family):
                 raise UserError(f"run: {where} has a {type(part).__name__} in the wrong place.")
-        names = {k: str(about["names"].get(k, "")) for k in ("task", "algorithm", "preset")}
-        return cls(directory, Trainer(*parts), about["seed"], names)
+        return cls(directory, Trainer(*parts), about["seed"], names, tuple(warnings))
 
     @property
     def game(self) -> AbstractGame:
         return self.trainer.game
 
     @property
+    def labels(self) -> dict[str, str]:
+        """`names` to be shown: of path/to/file.py:Name the Name alone."""
+        return {part: name.rpartition(":")[2] for part, name in self.names.items()}
+
+    @property
     def title(self) -> str:
-        named = [self.names[k].rpartition(":")[2] for k in ("task", "algorithm") if k in self.names]
+        named = [self.labels[k] for k in ("task", "algorithm") if k in self.names]
         return " ".join([*named, f"seed {self.seed}"])
 
     @property
@@ -211,6 +237,17 @@ class Run:
         kept = [line for line in self.history() if line.get("iteration", 0) <= iteration]
         text = "".join(json.dumps(line) + "\n" for line in kept)
         store.write_text_atomic(self.directory / "log.jsonl", text)
+
+
+def _recorded(code: Any, part: str, where: str, own: Iterable[str]) -> dict[str, Any]:
+    """What run.json says of the user's code in one part; old ones say nothing, all is `own`."""
+    if code is None:
+        return {"sha256": None, "classes": list(own)}
+    match code.get(part, {"sha256": None, "classes": []}) if isinstance(code, dict) else None:
+        case {"sha256": str() | None, "classes": [*classes]} as found:
+            if all(isinstance(name, str) for name in classes):
+                return found
+    raise UserError(f"run: {where} has a 'code' of the wrong kind; use another copy of this run.")
 
 
 def _fits(policy: Policy, game: AbstractGame) -> bool:

@@ -28,12 +28,12 @@ import secrets
 import shutil
 import stat
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -214,13 +214,23 @@ def lock(directory: Path) -> Iterator[None]:
 
 def write_text_atomic(path: Path, text: str) -> None:
     """Replace the file by `text`; at every instant the old or the new one is there, whole."""
-    write_bytes_atomic(path, text.encode())
-
-
-def write_bytes_atomic(path: Path, data: bytes) -> None:
-    """Replace the file by `data`; at every instant the old or the new one is there, whole."""
     with _beside(path) as scratch:
-        _write_file(scratch, [data])
+        _write_file(scratch, [text.encode()])
+        os.replace(scratch, path)
+        _sync(path.parent)
+
+
+def write_bytes_atomic(path: Path, writer: Callable[[BinaryIO], object]) -> None:
+    """Replace the file by what `writer` writes into the open file it is given, whole or not at all.
+
+    As in `write_bytes_atomic(path, lambda file: figure.savefig(file, format="png"))`: a full disk
+    leaves the old file, and is said in one sentence (UserError).
+    """
+    with _beside(path) as scratch:
+        with open(scratch, "xb") as file:
+            writer(file)
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(scratch, path)
         _sync(path.parent)
 
