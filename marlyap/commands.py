@@ -207,18 +207,21 @@ def tabulate(result: dict[str, Any], found: Sequence[groups.Measured]) -> None:
         title_justify="left",
         box=box.SIMPLE_HEAD,
         pad_edge=False,
-        collapse_padding=True,
+        padding=0,  # the box has a blank between columns; names need the room on 80 of them
     )
     table.add_column("run", overflow="fold", min_width=10)
     percent = f"{100 * first['confidence']:g} %"
     heads = ["success", percent, "rest", "stays", *["broken"] * ruled, "in .05"]
     for head in [*heads, "median", "95 %", "m/s", "rad/s", "settled"]:
         table.add_column(head, justify="right", no_wrap=True)
-    several = [dict(t, name=f"{t['group']}: {t['about']}") for t in teams if len(t["seeds"]) > 1]
-    for row in rows + several:
-        table.add_row(*cells(row, ruled))
+    by_name = {row["name"]: row for row in rows}
+    for members, team in zip(groups.grouped(found).values(), teams, strict=True):
+        for row in [by_name[m.name] for m in members]:
+            table.add_row(*cells(row, ruled))
+        if len(members) > 1:
+            table.add_row(*cells(team | {"name": team["about"]}, ruled))
     console = Console()
-    console = Console(width=max(console.width, 96)) if ruled else console
+    console = console if console.is_terminal else Console(width=max(console.width, 110))
     console.print(table)
     console.print(
         "success, rest (no agent above 0.1 m/s or 0.1 rad/s), stays (in every step until "

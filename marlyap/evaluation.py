@@ -134,6 +134,7 @@ class Evaluation(eqx.Module):
             return RESTS
         speed, spin = np.median(self.speed[moving]), np.median(self.spin[moving])
         what = "circles inside the ball" if spin > REST else "keeps moving inside the ball"
+        what = "turns on the spot" if speed <= REST else what
         return f"{what} (median {speed:.2g} m/s, {spin:.2g} rad/s)"
 
 

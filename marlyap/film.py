@@ -1,7 +1,7 @@
 """What a report shows: films, curves and numbers, as the plain values of `report.Page`."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import equinox as eqx

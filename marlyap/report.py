@@ -328,8 +328,8 @@ def _runs(page: Page) -> str:
     body += [_run_row(g, radii, ruled) for g in groups if len(g.get("seeds") or ()) > 1]
     more = next((n for run in runs if (n := _number(run.get("beyond_steps")))), None)
     note = (
-        "Each run was evaluated on the same held-out starts with its deterministic policy. At rest: "
-        "no agent faster than 0.1 m/s or 0.1 rad/s at the last step. "
+        "Each run was evaluated on the same held-out starts with its deterministic policy. At "
+        "rest: no agent faster than 0.1 m/s or 0.1 rad/s at the last step. "
         + (f"Stays: succeeds in every one of {more:,.0f} steps more. " if more else "")
         + "Distance, speed and spin are those of the worst agent at the last step. Two figures in "
         "a cell: the median, and what 95 % of the episodes stay under."
