@@ -1,5 +1,6 @@
 """What a report shows: films, curves and numbers, as the plain values of `report.Page`."""
 
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from marlyap import config, graph as graphs, groups, store
+from marlyap.algorithms import ALGORITHMS, PRESETS
 from marlyap.certificate import start_of
 from marlyap.errors import UserError
 from marlyap.evaluation import episode, evaluate
@@ -19,6 +21,8 @@ from marlyap.lyapunov_function import CostSum, at_target
 from marlyap.rollout import Controller, rollout, until
 from marlyap.run import Run
 from marlyap.seeds import Purpose, stream
+from marlyap.tasks import TASKS
+from marlyap.trainer import schedule_for
 from marlyap.types import Key, State, Trajectory
 
 
@@ -146,25 +150,44 @@ def common(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return kept
 
 
-def changed_fields(run: Run) -> dict[str, Any]:
+def changed_fields(run: Run) -> dict[str, str]:
     """Fields of a run, by dotted name, that are not what their class has by default."""
-    found: dict[str, Any] = {}
-
-    def walk(thing: Any, usual: Any, path: str) -> None:
-        for name, value in config.fields(thing).items():
-            normal = config.fields(usual).get(name) if usual is not None else None
-            if isinstance(value, eqx.Module):
-                same = type(value) is type(normal)
-                if not same:
-                    found[f"{path}.{name}"] = config.show(value)
-                walk(value, normal if same else _usual(value), f"{path}.{name}")
-            elif usual is None or value != normal:
-                found[f"{path}.{name}"] = config.show(value)
-
-    t = run.trainer
+    t, found = run.trainer, {}
     for part, value in {"task": t.game, "algorithm": t.algorithm, "schedule": t.schedule}.items():
-        walk(value, _usual(value), part)
+        found |= changed_from(value, _usual(value), part)
     return found
+
+
+def changed_from(thing: Any, usual: Any, path: str) -> dict[str, str]:
+    """Fields of an object, by dotted name, that are not what they usually are."""
+    found: dict[str, str] = {}
+    for name, value in config.fields(thing).items():
+        normal = config.fields(usual).get(name) if usual is not None else None
+        if isinstance(value, eqx.Module):
+            if type(value) is not type(normal):
+                found[f"{path}.{name}"] = config.show(value)
+                normal = _usual(value)
+            found |= changed_from(value, normal, f"{path}.{name}")
+        elif usual is None or value != normal:
+            found[f"{path}.{name}"] = config.show(value)
+    return found
+
+
+def _command(run: Run) -> str:
+    """The command that trains this run; empty where its parts cannot be named."""
+    name = run.names
+    if name["task"] not in TASKS or name["algorithm"] not in ALGORITHMS:
+        return ""  # code of the user's own, or an object made in Python
+    rule = PRESETS.get(name["preset"] or "tuned", PRESETS["tuned"])(ALGORITHMS[name["algorithm"]])
+    plan = schedule_for(rule, name["preset"] or "tuned")
+    words = ["marlyap", "train", name["task"], name["algorithm"], "--seeds", str(run.seed)]
+    words += ["--preset", name["preset"]] * (name["preset"] not in ("", "tuned"))
+    t = run.trainer
+    usual = {"task": TASKS[name["task"]], "algorithm": rule, "schedule": plan}
+    for part, value in {"task": t.game, "algorithm": t.algorithm, "schedule": t.schedule}.items():
+        for field, shown in changed_from(value, usual[part], part).items():
+            words += [f"--{field}", shown]
+    return shlex.join(words)
 
 
 def _usual(thing: Any) -> Any:
@@ -176,13 +199,13 @@ def _usual(thing: Any) -> Any:
 
 
 def _training(run: Run, label: str) -> dict[str, Any]:
-    """When, with what and by which command a run was made, as far as it was written down."""
+    """When and with what a run was made, and the command that makes it again."""
     about = store.read_json(run.directory / "run.json")
     versions = about.get("versions") if isinstance(about.get("versions"), dict) else {}
     seconds = [line.get("seconds") for line in history(run)[0][-1:]]
     return {
         "name": label,
-        "command": str(about.get("command") or ""),
+        "command": _command(run),
         "made": str(about.get("created") or ""),
         "seed": run.seed,
         "seconds": seconds[0] if seconds else None,
