@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from marlyap import store
+from marlyap.provenance import provenance
 from marlyap.statistics import (
     iqm,
     lower_bound,
@@ -175,7 +176,8 @@ def main() -> None:
     if not args.quick:
         kept = store.read_json(RESULTS) if RESULTS.is_file() else {}
         RESULTS.parent.mkdir(exist_ok=True)
-        store.write_text_atomic(RESULTS, json.dumps(kept | found, indent=1) + "\n")
+        text = json.dumps(kept | found | {"made": provenance()}, indent=1) + "\n"
+        store.write_text_atomic(RESULTS, text)
 
 
 if __name__ == "__main__":

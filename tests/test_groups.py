@@ -120,7 +120,12 @@ def test_pairs_are_compared_on_one_game_and_the_same_starts_alone():
 
 
 def test_the_order_does_not_matter():
-    found = [made("a"), made("b", 1), made("c", algorithm=CONTROL), made("d", game=Rendezvous(agents=5))]
+    found = [
+        made("a"),
+        made("b", 1),
+        made("c", algorithm=CONTROL),
+        made("d", game=Rendezvous(agents=5)),
+    ]
     teams = {frozenset(m.name for m in members) for members in groups.grouped(found).values()}
     for order in itertools.permutations(found):
         again = groups.grouped(order)
