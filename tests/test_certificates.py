@@ -9,12 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap.certificate import AbstractCertificate, Verdict, percent, sentence, start_of
+from marlyap.certificate import (
+    AbstractCertificate,
+    Verdict,
+    failures_allowed,
+    percent,
+    sentence,
+    start_of,
+)
 from marlyap.certificates import CERTIFICATES, bounds
 from marlyap.certificates.basin import Basin, largest_level
 from marlyap.certificates.closed_form import ClosedForm
 from marlyap.certificates.composition import Composition, fit_row
-from marlyap.certificates.contraction import Contraction, failures_allowed
+from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
 from marlyap.certificates.linearisation import Linearisation
 from marlyap.certificates.proof import Loop, Proof, extents, lyapunov
