@@ -30,7 +30,7 @@ from marlyap.types import Key
 
 def claim(bound: float, count: int, arrived: str, seconds: float, without: dict[str, str]) -> str:
     """`without` says for each perturbation that could not be applied why."""
-    left = f" (without: {listed(without)})" if without else ""
+    left = f" (left out: {listed(without)})" if without else ""
     return (
         f"under each of {count} perturbations{left} at least "
         f"{percent(bound)} of starts end with {arrived} at {seconds:g} s"
