@@ -141,5 +141,5 @@ def test_nothing_is_silently_absent(run, tmp_path, capsys):
     lines = out.strip().splitlines()
     assert code == 0 and lines[0].startswith("[statistical] reach: at least 0.00 % of starts end")
     assert lines[0].endswith("Asked 98 %, shown 0.00 % (confidence 98.00 %): not reached.")
-    assert "[left out] contraction: contraction: 20 steps do not fit into an episode of 12" in out
+    assert "[left out] contraction: 20 steps do not fit into an episode of 12" in out
     assert lines[-1] == "Information: each agent acts on its own observation."

@@ -202,8 +202,8 @@ class Loop:
     """f(x) = one step under the controller, for boxes of reduced states."""
 
     def __init__(self, game: Any, controller: Any):
-        policy = controller.policy if type(controller) is Decentralised else None
-        pi: Any = policy.pi if type(policy) is Greedy else None
+        policy: Any = controller.policy if type(controller) is Decentralised else None
+        pi = policy.pi if type(policy) is Greedy else None
         if game.agents != 1 or type(pi) is not Actors:
             raise UserError(
                 "proof: only a trained policy of one agent, unicycle or double integrator with "
