@@ -31,7 +31,7 @@ What the condition does not say:
   states alike. At single states it holds only as far as it is measured (certificate `decrease`).
 * The weight follows L(s', a') - L(s, a) + decrease c. For `literal` and `hinge` the margin
   slope ||a_phi - a|| is part of the penalty and not of what the weight follows.
-* J_L is fitted to the whole replay memory, random warm-up included. L is then the T-step cost sum of
+* J_L is fitted to the whole replay memory, random warm-up included: L is the T-step cost sum of
   a mixture of old policies, not of the current one.
 * L is a sum of squares of features and not zero on the target set by construction; with function
   `norm` it is.
