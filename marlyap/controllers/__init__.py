@@ -4,7 +4,10 @@ import inspect
 from pathlib import Path
 
 from marlyap.controllers.cascade import Cascade as Cascade
-from marlyap.controllers.controller import AbstractController as AbstractController
+from marlyap.controllers.controller import (
+    AbstractController as AbstractController,
+    as_action as as_action,
+)
 from marlyap.controllers.gradient import GradientConsensus as GradientConsensus
 from marlyap.controllers.lin_francis_maggiore import LinFrancisMaggiore as LinFrancisMaggiore
 from marlyap.controllers.optimal import OptimalControl as OptimalControl, Replayed as Replayed
