@@ -646,7 +646,7 @@ def termination(probe: Probe) -> Faults:
     usual = float(reward[others if others.any() else last].mean())
     left = np.minimum(probe.game.horizon - 1 - time, LOOKAHEAD)
     ending, going_on = reward[episode, time].mean(), usual * (1 + left.mean())
-    probe.figures |= {"reward at the end": float(ending), "of continuing": float(going_on)}
+    probe.figures |= {"reward at the end": float(ending), "reward of going on": float(going_on)}
     # Half of it is charge enough: a learnt policy has smaller costs ahead than random actions.
     if going_on < 0 and ending > going_on / 2:
         yield (

@@ -88,7 +88,7 @@ class APG(AbstractModelBased):
         return jnp.mean(jnp.where(now >= game.radius, delta, 0.0))
 
     def improve(self, learner, game, keys, decay):
-        """phi <- phi - rate grad J, clipped to norm `clip`; entries that are not finite count as 0."""
+        """phi <- phi - rate grad J, clipped to norm `clip`; entries not finite count as 0."""
         l = learner
 
         @eqx.filter_value_and_grad(has_aux=True)
