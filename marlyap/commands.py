@@ -19,7 +19,7 @@ from rich.table import Table
 from marlyap import config, film, groups, store
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.algorithms import ALGORITHMS, PRESETS
-from marlyap.certificate import sentence
+from marlyap.certificate import arrival, sentence
 from marlyap.certificates import CERTIFICATES
 from marlyap.certificates.safety import has_rules
 from marlyap.certify import certify, save
@@ -198,11 +198,11 @@ def keep(run: Run, row: dict[str, Any]) -> list[str]:
 def tabulate(result: dict[str, Any], found: Sequence[groups.Measured]) -> None:
     """The evaluation as a table on standard output, and what it says in words."""
     rows, teams = result["runs"], result["groups"]
-    first, radii = rows[0], {row["radius"] for row in rows}
-    near = f"{radii.pop():g} m" if len(radii) == 1 else "the task's radius"
-    ruled = any(rules(m.game) for m in found) or any(r["violations"]["successes"] for r in rows)
+    first, asked = rows[0], {arrival(m.game) for m in found}
+    reached = asked.pop() if len(asked) == 1 else "as each task defines it"
+    ruled = any(has_rules(m.game) for m in found) or any(r["violations"]["successes"] for r in rows)
     title = f"{first['episodes']} held-out starts of seed {result['start_seed']}; "
-    title += f"success: all within {near} at the last step"
+    title += f"success at the last step: {reached}"
     table = Table(
         title=title,
         title_justify="left",
@@ -264,11 +264,6 @@ def cells(row: dict[str, Any], ruled: bool) -> list[str]:
         number(row["final_spin"]["0.5"], 2),
         number(row["settling_time"]["0.5"], 1),
     ]
-
-
-def rules(game: AbstractGame) -> bool:
-    """Whether the game has rules that can be broken."""
-    return type(game).violations is not AbstractGame.violations
 
 
 SAMPLED = ("reach", "reach-and-stay", "decrease", "contraction", "basin", "quantiles")

@@ -12,7 +12,7 @@ import numpy as np
 
 from marlyap import config, graph as graphs, groups, store
 from marlyap.algorithms import ALGORITHMS, PRESETS
-from marlyap.certificate import start_of
+from marlyap.certificate import percent, start_of
 from marlyap.errors import UserError
 from marlyap.evaluation import episode, evaluate
 from marlyap.game import AbstractGame
@@ -350,6 +350,8 @@ def certificates(run: Run, game: AbstractGame, label: str) -> dict[str, list[Any
         scope = ", ".join(f"{k}: {v}" for k, v in known.items())
         row = {k: verdict[k] for k in ("claim", "evidence", "holds", "bound", "confidence")}
         row |= {"asked": verdict["figures"].get("share_asked"), "run": label}
+        if row["asked"] is not None and row["bound"] is not None:
+            row["shown"] = percent(row["bound"])
         shown["certificates"].append(row | {"name": name, "scope": scope})
         case = verdict["worst"] or {}
         if {"purpose", "episode"} <= {*case} and "change" not in case:

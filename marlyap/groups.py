@@ -51,17 +51,22 @@ def of_run(
 ) -> Measured:
     """A run that was measured on its own game, or on another, which may be `called` something."""
     asked = run.game if game is None else game
-    trained = {"task": run.game, "algorithm": run.trainer.algorithm}
-    trained |= {"schedule": run.trainer.schedule}
-    configuration = {part: record(value) for part, value in trained.items()}
-    base = f"{run.labels['task']} {run.labels['algorithm']}"
-    if run.names.get("preset", "") not in ("", "tuned"):
-        base += f" ({run.names['preset']})"
+    base, configuration = configured(run)
     if not same_game(asked, run.game):
         configuration["measured on"] = record(asked)
         base += f" measured on {told(run.game, asked, called)}"
     place = str(run.directory)
     return Measured(place, base, configuration, asked, starts, evaluation, run.seed)
+
+
+def configured(run: Run) -> tuple[str, dict[str, Any]]:
+    """What a run is called, and the record of all that it was trained with but its seed."""
+    t = run.trainer
+    parts = {"task": t.game, "algorithm": t.algorithm, "schedule": t.schedule}
+    base = f"{run.labels['task']} {run.labels['algorithm']}"
+    if run.names.get("preset", "") not in ("", "tuned"):
+        base += f" ({run.names['preset']})"
+    return base, {part: record(value) for part, value in parts.items()}
 
 
 def told(trained: AbstractGame, asked: AbstractGame, called: str = "") -> str:
@@ -81,21 +86,29 @@ def same_game(a: AbstractGame, b: AbstractGame) -> bool:
 
 
 def grouped(found: Sequence[Measured]) -> dict[str, list[Measured]]:
-    """Those that belong together under their group's name, in order of appearance.
-
-    A name says task and algorithm and, where several groups share those, the fields that differ.
-    """
+    """Those that belong together under their group's name, in order of appearance."""
+    names = named([(one.base, one.configuration) for one in found])
+    called: dict[str, str] = {}
     groups: dict[str, list[Measured]] = {}
-    for one in found:
-        groups.setdefault(one.key, []).append(one)
-    named: dict[str, list[Measured]] = {}
-    for members in groups.values():
-        base = members[0].base
-        alike = [g[0].configuration for g in groups.values() if g[0].base == base]
-        mine = alike.index(members[0].configuration)
-        apart = differing(alike)[mine]
-        named[f"{base} ({apart})" if apart else base] = members
-    return named
+    for name, one in zip(names, found, strict=True):
+        if one.key not in called:  # a name never joins two configurations
+            called[one.key] = f"{name}, another" if name in groups else name
+        groups.setdefault(called[one.key], []).append(one)
+    return groups
+
+
+def named(configurations: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str]:
+    """A name for each configuration, given what it is called and its record; equal for equal ones.
+
+    It says task and algorithm and, where several configurations share those, the fields that
+    differ.
+    """
+    names = []
+    for base, configuration in configurations:
+        alike = [other for name, other in configurations if name == base]
+        apart = differing(alike)[alike.index(configuration)]
+        names.append(f"{base} ({apart})" if apart else base)
+    return names
 
 
 def differing(records: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -130,6 +130,7 @@ class Certificate(TypedDict, total=False):
     run: str  # whose it is
     holds: bool
     asked: float  # share of the starts that had to be shown
+    shown: str  # the bound in words
     bound: float | str
     confidence: float | str
     scope: str  # start distribution, horizon, disturbance
@@ -437,7 +438,7 @@ def _claim(c: Certificate, several: bool) -> str:
     head = _tag("h3", _of(c.get("name") or "claim", c, several) + verdict)
     facts: dict[str, Any] = {"evidence": c.get("evidence")}
     if share:
-        facts |= {"asked": _percent(asked), "shown": _at_least(shown)}
+        facts |= {"asked": _percent(asked), "shown": c.get("shown", _percent(shown))}
     else:
         facts |= {"bound": c.get("bound")}
     facts |= {key: c.get(key) for key in ("confidence", "scope", "text")}
@@ -447,11 +448,6 @@ def _claim(c: Certificate, several: bool) -> str:
         if value is not None
     )
     return _tag("article", head + _tag("p", _text(c.get("claim"))) + _tag("dl", pairs))
-
-
-def _at_least(share: float) -> str:
-    """A lower bound in per cent, rounded down."""
-    return f"{math.floor(1e4 * share + 1e-6) / 100:.2f} %"
 
 
 def _slice(part: Slice) -> str:

@@ -24,9 +24,25 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from marlyap import store
+from marlyap.certificate import AbstractCertificate, Found, Verdict, judged
+from marlyap.certificates.basin import Basin
+from marlyap.certificates.composition import Composition, _Windows, worst_excess
+from marlyap.certificates.contraction import Contraction, rates
+from marlyap.certificates.decrease import Decrease
+from marlyap.certificates.quantiles import NAMES, Quantiles
+from marlyap.certificates.reach import Reach, ReachAndStay
+from marlyap.certificates.robustness import Robustness
+from marlyap.certificates.safety import Apart, Safe
+from marlyap.dynamics import AbstractDynamics, SingleIntegrator
+from marlyap.game import AbstractGame
+from marlyap.lyapunov_function import CostSum
+from marlyap.perturb import Perturbed, traced
 from marlyap.provenance import provenance
 from marlyap.statistics import (
     iqm,
@@ -37,6 +53,7 @@ from marlyap.statistics import (
     stratified_bootstrap,
     two_level_bootstrap,
 )
+from marlyap.types import State
 
 
 RESULTS = Path(__file__).parent / "results" / "coverage.json"
@@ -139,8 +156,8 @@ def intervals(quick: bool) -> list[dict[str, Any]]:
     """Coverage by distribution, number of seeds and method."""
     repetitions, episodes, resamples = (40, 20, 100) if quick else (1000, 100, 400)
     rng, rows = np.random.default_rng(0), []
-    for (name, rates), seeds in itertools.product(RATES.items(), (1, 3, 5, 10, 20)):
-        missed = misses(rates, seeds, repetitions, episodes, resamples, rng)
+    for (name, drawn), seeds in itertools.product(RATES.items(), (1, 3, 5, 10, 20)):
+        missed = misses(drawn, seeds, repetitions, episodes, resamples, rng)
         rows.append(
             {"rates": name, "seeds": seeds, "repetitions": repetitions}
             | {"covered": {method: 1 - share for method, share in missed.items()}}
@@ -156,12 +173,155 @@ def above(missed: int, trials: int, allowed: float) -> bool:
 
 
 # -------------------------------------------------------------------------------------------------
+# Simulated coverage of sampled certificates
+# -------------------------------------------------------------------------------------------------
+
+ASKED = 0.9  # confidence of each certificate
+TRUTH = 1_000_000  # seed of the rollouts that the truth is known from
+
+
+class Ray(AbstractGame):
+    """Points that keep their bearing from the goal, which alone says how fast they come or go.
+
+    x_{t+1} = (1 - rate(bearing)) x_t + dt u, so that where a point is at any time is closed-form.
+    """
+
+    agents: int = 2
+    leaders: tuple[int, ...] = (0,)
+    graph: str = "complete"
+    radius: float = 0.1
+    dt: float = 0.1
+    horizon: int = 40
+    dynamics: AbstractDynamics = SingleIntegrator()
+    slowest: float = -0.01  # rate of the slowest bearing, from which points go away
+
+    def reset(self, key):
+        x = jax.random.uniform(key, (self.agents, 2), minval=-1.0, maxval=1.0)
+        return State(x=x, goal=jnp.zeros((self.agents, 2)), t=jnp.asarray(0))
+
+    def observe(self, state, links):
+        return state.x
+
+    def step(self, state, action):
+        bearing = jnp.arctan2(state.x[:, 1], state.x[:, 0]) / (2 * jnp.pi) + 0.5
+        rate = self.slowest + 0.27 * bearing[:, None]
+        x = (1 - rate) * state.x + 0.05 * self.dt * action
+        return State(x=x, goal=state.goal, t=state.t + 1, memory=state.memory)
+
+    def violations(self, state):
+        return self.crowded(state, 0.02)
+
+
+class Idle(eqx.Module):
+    """Do nothing."""
+
+    def __call__(self, state, key):
+        return jnp.zeros(state.x.shape)
+
+
+GAME, IDLE = Ray(), Idle()
+V = CostSum(controller=IDLE, T=10, ball=0.05)
+COMING = Ray(slowest=0.03)  # where no agent goes away, so that there is a basin
+# Each kind, small; what is claimed is a share, whose truth is that of the claim's own level.
+FEW = {"rollouts": 200, "share": 0.2, "confidence": ASKED}
+CHOSEN = FEW | {"calibration": 200, "share": 0.9}
+KINDS: dict[str, AbstractCertificate] = {
+    "reach": Reach(**FEW),
+    "reach-and-stay": ReachAndStay(**FEW),
+    "decrease": Decrease(**FEW),
+    "safe": Safe(**FEW),
+    "contraction": Contraction(**CHOSEN),
+    "apart": Apart(**CHOSEN),
+    "basin": Basin(**CHOSEN),
+    "quantiles": Quantiles(rollouts=200, q=0.9, confidence=ASKED),
+    "composition": Composition(**CHOSEN),
+    "robustness": Robustness(
+        **FEW, gains=(), noises=(1.0,), delays=(), drops=(), spreads=(0.7, 1.5), remove=False
+    ),
+}
+
+
+def seen(judge: Any, steps: int, rollouts: int, game: AbstractGame = GAME) -> Found:
+    """What a certificate's judge makes of very many rollouts."""
+    return judged(judge, game, IDLE, V, TRUTH, "certify", rollouts, steps)
+
+
+def truths(rollouts: int) -> dict[str, Callable[[Verdict], bool]]:
+    """For each kind of certificate: whether what a verdict claims is true."""
+    H = GAME.horizon
+    late = H + 40
+
+    def share(judge: Any, steps: int) -> Callable[[Verdict], bool]:
+        true = float(np.mean(seen(judge, steps, rollouts).holds))
+        return lambda v: v.bound <= true
+
+    falls = rates(seen(KINDS["contraction"].judge, H + 1, rollouts))  # pyright: ignore
+    gaps = seen(KINDS["apart"].judge, late, rollouts).figures["gap"]  # pyright: ignore
+    inside = seen(KINDS["basin"].judge, H + max(40, V.beyond), rollouts, COMING)  # pyright: ignore
+    ends = seen(KINDS["quantiles"].judge, H + V.beyond, rollouts).figures  # pyright: ignore
+    C = Composition()
+    windows = seen(_Windows(C.T), late + C.T, rollouts // 4, COMING).figures["V"]
+    curve = {
+        name: float(np.mean(seen(Reach().judge, H, rollouts, perturbed(change)).holds))
+        for name, change in KINDS["robustness"].perturbations(GAME).items()  # pyright: ignore
+    }
+
+    def basin(v: Verdict) -> bool:
+        below = inside.figures["V"] <= v.figures["level"]
+        low, high = v.figures["mass"]
+        known = not below.any() or v.bound <= np.mean(inside.holds[below])
+        return known and low <= np.mean(below) <= high
+
+    def quantiles(v: Verdict) -> bool:
+        bounds = v.figures["bounds"]
+        return all(np.mean(ends[name] <= bounds[name]) >= v.figures["q"] for name in NAMES)
+
+    def composition(v: Verdict) -> bool:
+        M, delta = (np.asarray(v.figures[name]) for name in ("M", "delta"))
+        return v.bound <= np.mean(worst_excess(windows, M, delta, C.T) <= 0)
+
+    robust = lambda v: all(p["bound"] <= curve[p["perturbation"]] for p in v.figures["curve"])
+    return {
+        "reach": share(Reach().judge, H),
+        "reach-and-stay": share(ReachAndStay().judge, late),
+        "decrease": share(KINDS["decrease"].judge, H + V.beyond),  # pyright: ignore
+        "safe": share(Safe().judge, late),
+        "contraction": lambda v: v.bound <= np.mean(falls >= v.figures["beta"]),
+        "apart": lambda v: v.bound <= np.mean(gaps >= v.figures["gap"]),
+        "basin": basin,
+        "quantiles": quantiles,
+        "composition": composition,
+        "robustness": robust,
+    }
+
+
+def perturbed(change: dict[str, Any]) -> AbstractGame:
+    return traced(Perturbed(inner=GAME, **change))
+
+
+def certificates(quick: bool) -> list[dict[str, Any]]:
+    """How often each kind of certificate claims what is not true."""
+    count, rollouts = (40, 20_000) if quick else (1000, 200_000)
+    true, rows = truths(rollouts), []
+    for name, certificate in KINDS.items():
+        game = COMING if name in ("basin", "composition") else GAME
+        verdicts = [certificate.check(game, IDLE, V, seed) for seed in range(count)]
+        claims = [v for v in verdicts if v.bound is not None]  # others claim nothing
+        wrong = sum(not true[name](v) for v in claims)
+        about = {"kind": name, "certificates": count, "claims": len(claims)}
+        rows.append(about | {"asked": ASKED, "wrong": int(wrong)})
+        print(f"{name}: {wrong} of {len(claims)} are wrong, {1 - ASKED:.0%} may be", flush=True)
+    return rows
+
+
+# -------------------------------------------------------------------------------------------------
 # The command line
 # -------------------------------------------------------------------------------------------------
 
 PARTS: dict[str, Callable[[bool], list[dict[str, Any]]]] = {
     "exact": exact,
     "intervals": intervals,
+    "certificates": certificates,
 }
 
 

@@ -1,5 +1,6 @@
 """Intervals and certificates hold what they promise: the quick forms of reliability/coverage.py."""
 
+import dataclasses
 import importlib.util
 import itertools
 import json
@@ -65,10 +66,32 @@ def test_the_truth_about_simulated_seeds(coverage):
     assert found["ones, three in ten from 0.4"] == pytest.approx((0.91, 0.995), abs=1e-3)
 
 
+def test_no_sampled_certificate_is_wrong_more_often_than_it_says(coverage):
+    rows = {row["kind"]: row for row in coverage.certificates(quick=True)}
+    assert rows.keys() == coverage.KINDS.keys()
+    for row in rows.values():
+        assert row["claims"] == 40, row
+        assert not coverage.above(row["wrong"], row["claims"], 1 - row["asked"]), row
+
+
+def test_a_certificate_that_claims_its_own_estimate_is_found_out(coverage):
+    """Without a margin a claimed share is too high half of the time."""
+    true = coverage.truths(2_000)["reach"]
+    check = lambda seed: coverage.KINDS["reach"].check(
+        coverage.GAME, coverage.IDLE, coverage.V, seed
+    )
+    verdicts = [check(seed) for seed in range(40)]
+    bare = [dataclasses.replace(v, bound=v.successes / v.trials) for v in verdicts]
+    assert coverage.above(sum(not true(v) for v in bare), 40, 0.1)
+
+
 def test_the_published_figures_are_those_of_the_full_form(coverage):
     kept = json.loads(coverage.RESULTS.read_text())
     assert kept.keys() == {*coverage.PARTS, "made"}
     assert all(row["least"] >= row["asked"] - 1e-9 for row in kept["exact"])
+    for row in kept["certificates"]:
+        assert row["certificates"] == 1000 and row["claims"] > 900
+        assert not coverage.above(row["wrong"], row["claims"], 1 - row["asked"]), row
     for row in kept["intervals"]:
         wrong = round(row["repetitions"] * (1 - row["covered"]["exact, mean"]))
         assert not coverage.above(wrong, row["repetitions"], 1 - coverage.LEVEL)

@@ -152,6 +152,7 @@ def full_page() -> dict:
                 "holds": False,
                 "asked": 0.98,
                 "bound": 0.95229,
+                "shown": "95.22 %",
                 "confidence": 0.95,
                 "text": "sampled",
             }
@@ -269,8 +270,12 @@ def test_several_configurations_have_no_figure_in_common():
 @pytest.mark.parametrize(
     ("claim", "badge", "shows"),
     [
-        ({"holds": True, "asked": 0.95, "bound": 0.96}, "reached", "shown 96.00 %"),
-        ({"holds": False, "asked": 0.95, "bound": 0.94999}, "not reached", "shown 94.99 %"),
+        ({"holds": True, "asked": 0.95, "bound": 0.96}, "reached", "shown 96.0 %"),
+        (
+            {"holds": False, "asked": 0.95, "bound": 0.9499, "shown": "94.99 %"},
+            "not reached",
+            "shown 94.99 %",
+        ),
         ({"holds": False, "asked": 0.95, "bound": 0.96}, "does not hold", "bound 0.96"),
         ({"holds": True, "bound": 0.5}, "holds", "bound 0.5"),
         ({"holds": False}, "does not hold", "reach"),
