@@ -247,7 +247,7 @@ def _header(page: Page) -> str:
         head += _verdict(groups[0], starts)
     elif groups:
         head += _tag("div", "".join(_one_of_several(group) for group in groups), cls="verdicts")
-    texts = dict.fromkeys(str(group["text"]) for group in groups if group.get("text"))
+    texts = dict.fromkeys(text for group in groups if (text := group.get("text")))
     head += "".join(_tag("p", _text(text), cls="caveat") for text in texts)
     return head + "".join(_tag("p", _text(n), cls="caveat warn") for n in page.get("notes") or ())
 
@@ -513,7 +513,7 @@ def _trainings(trainings: Sequence[Training]) -> str:
         versions = ", ".join(f"{k} {v}" for k, v in (t.get("versions") or {}).items())
         cells = [_integer(t.get("seed")), _text(t.get("made") or None), _duration(t.get("seconds"))]
         body.append(_row(_text(t.get("name")), [*cells, _text(t.get("policy")), _text(versions)]))
-    commands = dict.fromkeys(t["command"] for t in trainings if t.get("command"))
+    commands = dict.fromkeys(command for t in trainings if (command := t.get("command")))
     said = "".join(_tag("pre", _text(command), cls="command") for command in commands)
     return _tag("h3", "Training") + said + _table(head, body, words=(0, 5))
 
