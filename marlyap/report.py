@@ -394,8 +394,7 @@ def _certificates(certificates: Sequence[Certificate], slices: Sequence[Slice]) 
     """Each claim with its evidence and reach, then the level sets of V."""
     if not certificates:
         return ""
-    several = len({c.get("run") for c in certificates}) > 1
-    claims = "".join(_claim(c, several) for c in certificates)
+    claims = "".join(_claim(c) for c in certificates)
     note = (
         "Each claim is about this policy, from starts of the kind stated and no others. "
         "<b>Statistical</b>: shown on fresh starts, at the confidence stated. <b>Proved</b>: for "
@@ -403,10 +402,10 @@ def _certificates(certificates: Sequence[Certificate], slices: Sequence[Slice]) 
         "among the films above."
     )
     figures = "".join(
-        _captioned(_slice(part), f"{_tag('b', 'V')} along {_of(part.get('label'), part, several)}")
+        _captioned(_slice(part), f"{_tag('b', 'V')} along {_of(part.get('label'), part)}")
         for part in slices
     )
-    charts = _tag("div", figures, cls="charts") if figures else ""
+    charts = _tag("div", figures, cls="charts slices") if figures else ""
     if figures:
         facing = ", facing right," if any(part.get("headings") for part in slices) else ""
         dashed = any(c.get("certified") for part in slices for c in part.get("contours") or ())
@@ -419,13 +418,12 @@ def _certificates(certificates: Sequence[Certificate], slices: Sequence[Slice]) 
     return _section("Certificates", _tag("div", claims, cls="claims") + charts, note)
 
 
-def _of(text: Any, part: Mapping[str, Any], several: bool) -> str:
-    """Something, and whose it is where there are several."""
-    whose = f" · {_text(part.get('run'))}" if several and part.get("run") else ""
-    return _text(text) + whose
+def _of(text: Any, part: Mapping[str, Any]) -> str:
+    """Something, and whose it is where that is said."""
+    return _text(text) + (f" · {_text(part.get('run'))}" if part.get("run") else "")
 
 
-def _claim(c: Certificate, several: bool) -> str:
+def _claim(c: Certificate) -> str:
     """One claim: what was asked, what was shown, and whether that is enough."""
     holds, asked, shown = c.get("holds"), _number(c.get("asked")), _number(c.get("bound"))
     share = asked is not None and shown is not None and holds == (shown >= asked)
@@ -435,7 +433,7 @@ def _claim(c: Certificate, several: bool) -> str:
     }
     kind = "holds" if holds else "fails"
     verdict = "" if holds is None else _tag("span", words[holds], cls=f"mark {kind}")
-    head = _tag("h3", _of(c.get("name") or "claim", c, several) + verdict)
+    head = _tag("h3", _of(c.get("name") or "claim", c) + verdict)
     facts: dict[str, Any] = {"evidence": c.get("evidence")}
     if share:
         facts |= {"asked": _percent(asked), "shown": c.get("shown", _percent(shown))}

@@ -611,7 +611,7 @@ def test_demo_goes_on_with_what_is_there_and_prints_one_object(run, capsys):
     code, out, err = call(capsys, *words)
     found = strict(out)
     assert code == 0 and SHARE | {"report", "seconds"} <= found.keys()
-    assert found["episodes"] == 500 and "of 500 fresh starts succeeded" in err
+    assert found["episodes"] == 500 and "of 500 held-out starts of seed 0 succeeded" in err
     refused(capsys, *words, "--seeds", "0", "7", parts=["seed7 is not there"])
 
 

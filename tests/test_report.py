@@ -248,7 +248,7 @@ def test_says_what_matters(text):
         "environment steps",
         "runs/a: log.jsonl is cut off",
         "asked 98.0 % shown 95.22 %",
-        "not reached",
+        "reach · seed 0 not reached",
     ):
         assert fact in words, fact
     assert words.count("start 12") == 2  # on its button and under its picture
