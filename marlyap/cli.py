@@ -6,12 +6,16 @@ Nothing here imports JAX, so help and bad usage answer at once.
 import argparse
 import json
 import os
+import signal
 import sys
+import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
-from marlyap.errors import UserError
+from marlyap.cache import enable_cache
+from marlyap.errors import UserError, explained
 
 
 OVERRIDES = """
@@ -176,34 +180,116 @@ def parser() -> Parser:
     return top
 
 
+def program() -> NoReturn:
+    """`main` as a process of its own, which Ctrl-C ends at once and without a traceback."""
+    on_interrupt_exit()
+    code = main()
+    with suppress(OSError, ValueError):
+        sys.stdout.flush()
+    if code == INTERRUPTED:
+        os._exit(code)  # a computation may still run in XLA's threads
+    sys.exit(code)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (0 done, 2 bad input, 130 or 143 stopped)."""
     argv = list(sys.argv[1:] if argv is None else argv)
     try:
-        args, overrides = parse(argv)
-        if args.version:
-            from importlib.metadata import version
-
-            print(version("marlyap"))
-            return 0
-        if args.verb is None:
-            parser().print_help()
-            return 0
-        prepare(args)
-        if getattr(args, "device", None):
-            find_device(args.device)
-        from marlyap import commands
-
-        result, code = commands.VERBS[args.verb](args, overrides)
-        if args.json and result is not None:
-            print(json.dumps(result))
+        code = command(argv)
+        sys.stdout.flush()
         return code
     except UserError as error:
-        print(f"marlyap: {error}", file=sys.stderr)
-        return 2
+        return refuse(str(error))
+    except KeyboardInterrupt:
+        tell_interrupted()
+        return INTERRUPTED
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        forget_output()
         return 1
+    except Exception as error:
+        said = explained(error)
+        if said is None and isinstance(error, OSError):
+            forget_output()
+            what = f"{error.filename} " if error.filename else "standard output "
+            said = f"{what}could not be written or read ({error.strerror}); check the disk."
+        if said is None:
+            raise
+        return refuse(said)
+
+
+def command(argv: list[str]) -> int:
+    """Run one command; returns its exit code."""
+    args, overrides = parse(argv)
+    if args.version:
+        from importlib.metadata import version
+
+        print(version("marlyap"))
+        return 0
+    if args.verb is None:
+        parser().print_help()
+        return 0
+    prepare(args)
+    if getattr(args, "device", None):
+        find_device(args.device)
+    from marlyap import commands
+
+    result, code = commands.VERBS[args.verb](args, overrides)
+    if args.json and result is not None:
+        print(json.dumps(result))
+    return code
+
+
+def refuse(sentence: str) -> int:
+    """Say it on standard error; the exit code of bad input."""
+    print(f"marlyap: {UserError(sentence)}", file=sys.stderr)
+    return 2
+
+
+def forget_output() -> None:
+    """Drop what standard output could not take, so that Python does not try again at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+INTERRUPTED = 128 + signal.SIGINT
+
+
+def on_interrupt_exit() -> None:
+    """Let Ctrl-C end this process at once, also while XLA compiles or computes.
+
+    Python runs a handler only between two of its own instructions, and an exception that one
+    raises within a callback of XLA is lost or crashes. So a thread is told of the signal too.
+    Files are replaced whole, so none is lost. Training sets a handler of its own (workers.Stop).
+    """
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signal.signal(signal.SIGINT, exit_interrupted)
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+
+    def watch() -> None:
+        while number := os.read(reader, 1):
+            ours = signal.getsignal(signal.SIGINT) is exit_interrupted
+            if number[0] == signal.SIGINT and ours:
+                exit_interrupted()
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def exit_interrupted(*_: object) -> NoReturn:
+    """One line and exit code 130, now."""
+    flush = threading.Thread(target=sys.stdout.flush, daemon=True)
+    flush.start()
+    flush.join(0.5)  # a full pipe must not keep us
+    tell_interrupted()
+    os._exit(INTERRUPTED)
+
+
+def tell_interrupted() -> None:
+    """Say what an interrupt left behind."""
+    store = sys.modules.get("marlyap.store")
+    wrote = store is not None and store.written
+    what = "the files written until now are complete" if wrote else "nothing was written"
+    with suppress(OSError):
+        os.write(2, f"\nmarlyap: interrupted; {what}.\n".encode())
 
 
 def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, dict[str, str]]:
@@ -239,12 +325,11 @@ def prepare(args: Any) -> None:
         raise UserError(f"on-nan: '{args.on_nan}' must be stop or rollback.")
     if device:
         os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": "cuda"}[device]
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_directory()))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # the small ones too
-    if args.verb in ("demo", "train"):
-        kept = Path(os.environ["JAX_COMPILATION_CACHE_DIR"], "programs")
-        os.environ.setdefault("MARLYAP_PROGRAMS", str(kept))
+    training = args.verb in ("demo", "train")
+    if training:
         os.environ.setdefault("NPROC", "1")  # products this small lose time to a second thread
+    if args.verb != "recheck" and (trouble := enable_cache(programs=training)):
+        print(f"marlyap: {trouble}", file=sys.stderr)
     core = os.environ.get("MARLYAP_CORE")
     if core and core.isdigit() and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {int(core)})
@@ -261,9 +346,3 @@ def find_device(device: str) -> None:
             f"device: JAX finds no {device} here; leave out --device, or install JAX for it, as "
             "in pip install 'jax[cuda13]'."
         ) from None
-
-
-def cache_directory() -> Path:
-    """Where compiled programs are kept between starts."""
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(base) / "marlyap" / "jax"

@@ -2,11 +2,14 @@
 
 import dataclasses
 import json
+import re
 import shlex
+import shutil
 import sys
 import time
 from argparse import Namespace
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,7 +26,7 @@ from marlyap.certificates import CERTIFICATES
 from marlyap.certify import certify, save
 from marlyap.conformance import conformance
 from marlyap.controllers import CONTROLLERS
-from marlyap.errors import UserError
+from marlyap.errors import UserError, within
 from marlyap.evaluation import Evaluation, compare, evaluate, pooled
 from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import cost_sum
@@ -31,7 +34,7 @@ from marlyap.recheck import recheck
 from marlyap.report import Film, Page, html
 from marlyap.run import Run, expand
 from marlyap.seeds import stream
-from marlyap.subject import changed
+from marlyap.subject import asked, changed
 from marlyap.tasks import TASKS
 from marlyap.trainer import Trainer, schedule_for
 from marlyap.workers import train_all
@@ -50,19 +53,47 @@ def train(args: Namespace, overrides: Overrides) -> Result:
         for option in [k for k, v in given.items() if v is not None]:
             raise UserError(f"{option}: a run that is resumed goes on as it is; leave it out.")
         args.task, args.algorithm = args.task or args.own_task, args.algorithm or args.own_algorithm
-        game, algorithm = own_code(args, overrides)
-        runs = [Run.open(d, game, algorithm) for d in expand(args.resume)]
+        if overrides:
+            raise UserError(f"--{next(iter(overrides))}: a run that is resumed keeps its settings.")
+        game = config.load(args.task, AbstractGame) if args.task else None
+        rule = config.load(args.algorithm, AbstractAlgorithm) if args.algorithm else None
+        runs = [Run.open(d, game, rule) for d in expand(args.resume)]
+        for run in runs:
+            for warning in run.warnings:
+                say(f"warning: {warning}")
+        readable(runs)
     else:
         if not args.task or not args.algorithm:
             raise UserError("train: name a task and an algorithm, as in train rendezvous masac.")
         runs = create(args, overrides)
-    code = train_all(runs, args)
+    code = trained(runs, args, new=not args.resume)
     state = [
         {"run": str(r.directory), "seed": r.seed, "steps": r.steps_done, "finished": r.finished}
         for r in runs
     ]
     say(f"{'Done' if code == 0 else 'Stopped'}: {', '.join(str(r.directory) for r in runs)}")
     return {"runs": state}, code
+
+
+def trained(runs: list[Run], args: Namespace, new: bool) -> int:
+    """Train; a new run in which training could not begin leaves no directory behind."""
+    try:
+        return train_all(runs, args)
+    except BaseException:
+        for run in runs if new else ():
+            if run.untouched:
+                shutil.rmtree(run.directory, ignore_errors=True)
+                with suppress(OSError):  # as when other runs are in it
+                    run.directory.parent.rmdir()
+        raise
+
+
+def readable(runs: list[Run]) -> None:
+    """Raise UserError where a finished run has no sound checkpoint left; nothing would train it."""
+    for run in runs:
+        if run.finished:
+            for warning in run.checkpoints.latest().warnings:
+                say(f"warning: {warning}")
 
 
 def create(args: Namespace, overrides: Overrides) -> list[Run]:
@@ -108,10 +139,11 @@ def own_code(
 
 def seeds(words: list[str]) -> list[int]:
     """The seeds asked for: whole numbers, each once."""
-    try:
-        numbers = [int(w) for word in words for w in word.split(",")]
-    except ValueError:
-        raise UserError(f"seeds: {' '.join(words)} are not all whole numbers.") from None
+    each = [w for word in words for w in word.split(",")]
+    for word in each:
+        if not re.fullmatch(r"[+-]?\d+", word.strip()):
+            raise UserError(f"seeds: '{word}' is not a whole number.")
+    numbers = [int(w) for w in each]
     if len(set(numbers)) != len(numbers):
         raise UserError(f"seeds: {' '.join(words)} names a seed twice.")
     if not all(0 <= n < 2**31 for n in numbers):
@@ -274,8 +306,8 @@ def recheck_certificate(args: Namespace, overrides: Overrides) -> Result:
 
 def check_task(args: Namespace, overrides: Overrides) -> Result:
     """`check-task`: one finding for every law; exit code 1 if one is broken."""
-    game, _ = own_code(Namespace(task=args.task, algorithm=None), overrides)
-    assert game is not None
+    game = asked(args.task, overrides)
+    within("seed", args.seed, 0, 2**31 - 1)
     found = conformance(game, args.seed)
     if not args.json:
         table = Table(title=args.task, title_justify="left", show_header=False)
@@ -399,6 +431,8 @@ def demo(args: Namespace, overrides: Overrides) -> Result:
     """Train, evaluate and report the main task; what is trained already is kept."""
     start = time.monotonic()
     names = [args.out / f"seed{s}" for s in seeds(args.seeds)]
+    for place in names:
+        Run.outside(place)
     job = Namespace(
         task="rendezvous",
         algorithm="masac-lyapunov",
@@ -420,10 +454,10 @@ def demo(args: Namespace, overrides: Overrides) -> Result:
                 f"seeds: {missing[0]} is not there beside {there[0]}; train all anew by --again."
             )
         runs = [Run.open(d) for d in names]
-        say(f"{args.out} holds these runs; going on with them. To train anew: demo --again")
+        say(f"{args.out} holds these runs, which are used again; to train anew: demo --again")
     else:
         runs = create(job, overrides)
-    code = train_all([r for r in runs if not r.finished], job)
+    code = trained([r for r in runs if not r.finished], job, new=not there or args.again)
     if code:
         return None, code
     out = args.out / "report.html"

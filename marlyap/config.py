@@ -23,7 +23,7 @@ from marlyap.algorithms import ALGORITHMS
 from marlyap.constraint import AbstractConstraint
 from marlyap.constraints import CONSTRAINTS
 from marlyap.dynamics import DYNAMICS, AbstractDynamics
-from marlyap.errors import UserError
+from marlyap.errors import UserError, first_line, raised_at
 from marlyap.game import AbstractGame
 from marlyap.tasks import TASKS
 from marlyap.trainer import Schedule
@@ -227,7 +227,9 @@ def _construct(cls: type[T], values: dict[str, Any], where: str) -> T:
     except UserError as error:
         raise UserError(f"{where}.{error}" if where and ":" not in where else str(error)) from None
     except Exception as error:  # whatever the constructor of a user's class may raise
-        raise UserError(f"{where or cls.__name__}: {error}.") from error
+        place = raised_at(error)
+        said = f"{place}: {first_line(error)}" if place else f"{error}"
+        raise UserError(f"{where or cls.__name__}: {said}.") from error
 
 
 def _parse(text: str, hint: Any, where: str) -> Any:
@@ -340,5 +342,8 @@ def _module(path: Path, word: str) -> types.ModuleType:
         del sys.modules[name]
         if isinstance(error, UserError) or not isinstance(error, (Exception, SystemExit)):
             raise
-        raise UserError(f"{word}: {path} could not be loaded: {error}.") from error
+        place = raised_at(error) or path.name
+        raise UserError(
+            f"{word}: {path} could not be loaded: {place}: {first_line(error)}."
+        ) from error
     return module

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from marlyap.errors import first_line, raised_at
 from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import at_target
 from marlyap.rollout import rollout
@@ -71,10 +72,10 @@ def _caught(law: Callable[[], Faults]) -> Faults:
 
 
 def _raised(method: str, error: Exception) -> str:
-    lines = str(error).strip().splitlines() or [""]
     traced = isinstance(error, (jax.errors.JAXTypeError, jax.errors.JAXIndexError))
     mend = "use jnp.where, not if or float()" if traced else "let it return for every state"
-    return f"{method}: it raised {type(error).__name__} ({lines[0].rstrip('.')[:160]}); {mend}."
+    place = f" at {place}" if (place := raised_at(error)) else ""
+    return f"{method}: it raised {first_line(error)}{place}; {mend}."
 
 
 # --- What is looked at ---------------------------------------------------------------------------

@@ -64,6 +64,9 @@ Arrays = Mapping[str, Any]  # of whatever np.asarray takes, JAX's arrays too
 Table = Mapping[str, Mapping[str, Any]]
 
 
+written = False  # whether this process has put a file in place
+
+
 class CorruptError(UserError):
     """What is on the disk is not what was written there."""
 
@@ -216,8 +219,7 @@ def write_text_atomic(path: Path, text: str) -> None:
     """Replace the file by `text`; at every instant the old or the new one is there, whole."""
     with _beside(path) as scratch:
         _write_file(scratch, [text.encode()])
-        os.replace(scratch, path)
-        _sync(path.parent)
+        _replace(scratch, path)
 
 
 def write_bytes_atomic(path: Path, writer: Callable[[BinaryIO], object]) -> None:
@@ -231,8 +233,7 @@ def write_bytes_atomic(path: Path, writer: Callable[[BinaryIO], object]) -> None
             writer(file)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(scratch, path)
-        _sync(path.parent)
+        _replace(scratch, path)
 
 
 def read_json(path: Path, limit_bytes: int = JSON_LIMIT) -> Any:
@@ -521,6 +522,13 @@ def _explained(path: Path) -> Iterator[None]:
         raise UserError(f"{path} could not be written ({error.strerror}); {mend}.") from error
 
 
+def _replace(scratch: Path, path: Path) -> None:
+    global written
+    os.replace(scratch, path)
+    written = True
+    _sync(path.parent)
+
+
 def _write_file(path: Path, chunks: Iterable[Any]) -> None:
     with open(path, "xb") as file:
         for chunk in chunks:
@@ -549,11 +557,13 @@ def _check_free(directory: Path, replace: bool) -> None:
 
 def _install(scratch: Path, directory: Path) -> None:
     """Rename into place. Between the two renames the old directory is the `.old` beside it."""
+    global written
     old = _scratch(directory, "old")
     try:
         with suppress(FileNotFoundError):
             os.rename(directory, old)
         os.rename(scratch, directory)
+        written = True
     except BaseException:
         with suppress(OSError):
             os.rename(old, directory)

@@ -1,4 +1,4 @@
-"""What a command is asked to measure: the run's own task or another, and never one not asked for."""
+"""What a command is asked to measure: the run's own task or another; nothing is ignored."""
 
 import json
 import shutil
