@@ -4,6 +4,7 @@ Nothing here imports JAX, so help and bad usage answer at once.
 """
 
 import argparse
+import difflib
 import json
 import os
 import signal
@@ -76,7 +77,50 @@ class Parser(argparse.ArgumentParser):
     """Errors are one sentence and exit code 2, like every other bad input."""
 
     def error(self, message: str) -> NoReturn:
+        head, _, rest = message.partition("unrecognized arguments: ")
+        if rest and not head:
+            word = rest.split()[0]
+            options = [o for a in self._actions for o in a.option_strings if o.startswith("--")]
+            near = difflib.get_close_matches(word.partition("=")[0], options, n=1)
+            hint = f"; did you mean {near[0]}?" if near else f"; see {self.prog} --help."
+            raise UserError(f"{self.prog}: there is no option {word}{hint}")
         raise UserError(f"{message}; see {self.prog} --help.")
+
+    def parse_known_args(self, args=None, namespace=None):  # pyright: ignore
+        """Of a verb: refuse here what it does not know, for here its options are known."""
+        found, rest = super().parse_known_args(args, namespace)
+        if rest:
+            self.error(f"unrecognized arguments: {' '.join(rest)}")
+        return found, rest
+
+
+class Once(argparse.Action):
+    """An option that cannot be given twice."""
+
+    def __call__(self, parser, namespace, values, option_string=None):  # pyright: ignore
+        given = namespace.__dict__.setdefault("given", set())
+        if self.dest in given:
+            raise UserError(f"{option_string}: it is given twice.")
+        given.add(self.dest)
+        setattr(namespace, self.dest, values)
+
+
+def number(text: str) -> int:
+    """A whole number, also as 1e5."""
+    try:
+        plain = float(text.replace("_", ""))
+        if plain.is_integer():
+            return int(text) if text.lstrip("+-").isdigit() else int(plain)
+    except (ValueError, OverflowError):
+        pass
+    raise argparse.ArgumentTypeError(f"'{text}' is not a whole number")
+
+
+def place(text: str) -> Path:
+    """A path that is not empty."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("the path is empty")
+    return Path(text)
 
 
 def parser() -> Parser:
@@ -110,35 +154,40 @@ def parser() -> Parser:
         )
 
     p = verb("demo", "train, evaluate and report the main task, from nothing to a film")
-    p.add_argument("--out", type=Path, default=Path("runs/demo"), help="directory of the runs")
-    p.add_argument("--seeds", nargs="+", default=["0"], help="training seeds (default 0)")
-    p.add_argument("--steps", type=int, default=None, help="environment steps of each")
+    p.add_argument("--out", type=place, default=Path("runs/demo"), help="directory of the runs")
+    p.add_argument(
+        "--seeds", nargs="+", action=Once, default=["0"], help="training seeds (default 0)"
+    )
+    p.add_argument("--steps", type=number, default=None, help="environment steps of each")
     p.add_argument("--again", action="store_true", help="train anew what is there already")
 
     p = verb("train", "train a team, one run for each seed", OVERRIDES)
-    p.add_argument("task", nargs="?", metavar="TASK", help="a name of `marlyap list`")
-    p.add_argument("algorithm", nargs="?", metavar="ALGORITHM", help="a name of `marlyap list`")
-    p.add_argument("--seeds", nargs="+", help="training seeds (default 0)")
-    p.add_argument("--steps", type=int, help="environment steps of each seed")
-    p.add_argument("--out", type=Path, default=None, help="directory (default runs/TASK/ALGORITHM)")
+    known = "a name that `marlyap list` shows, or path/to/file.py:Name"
+    p.add_argument("task", nargs="?", metavar="TASK", help=known)
+    p.add_argument("algorithm", nargs="?", metavar="ALGORITHM", help=known)
+    p.add_argument("--seeds", nargs="+", action=Once, help="training seeds (default 0)")
+    p.add_argument("--steps", type=number, help="environment steps of each seed")
+    p.add_argument(
+        "--out", type=place, default=None, help="directory (default runs/TASK/ALGORITHM)"
+    )
     p.add_argument("--preset", help="tuned (default) or paper")
     p.add_argument("--force", action="store_true", help="overwrite runs that are there")
-    p.add_argument("--resume", type=Path, nargs="+", metavar="RUN", help="go on with these runs")
+    p.add_argument("--resume", type=place, nargs="+", metavar="RUN", help="resume these runs")
     own = "where a resumed run's is your own code"
     p.add_argument("--task", dest="own_task", help=f"the task, {own}")
     p.add_argument("--algorithm", dest="own_algorithm", help=f"the algorithm, {own}")
     p.add_argument("--parallel", default="auto", help="seeds: auto, process (one a core) or vmap")
     p.add_argument("--device", default=None, help="cpu or gpu (default: what JAX finds)")
     p.add_argument(
-        "--on-nan", default="stop", help="a number not finite: stop (default) or rollback"
+        "--on-nan", default="stop", help="when numbers diverge: stop (default) or rollback"
     )
     p.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
 
     p = verb("evaluate", "measure runs or hand-written controllers on fresh starts", SUBJECT)
     p.add_argument("runs", nargs="+", metavar="RUN", help="run directories or controller names")
     on(p, "the task to measure on (default: that of each run; needed for controllers)")
-    p.add_argument("--episodes", type=int, default=500, help="fresh starts (default 500)")
-    p.add_argument("--seed", type=int, default=0, help="of the starts (default 0)")
+    p.add_argument("--episodes", type=number, default=500, help="fresh starts (default 500)")
+    p.add_argument("--seed", type=number, default=0, help="of the starts (default 0)")
     p.add_argument("--confidence", type=float, default=0.95, help="of the intervals")
 
     p = verb("certify", "say what holds of a run or controller, with what evidence", SUBJECT)
@@ -146,37 +195,41 @@ def parser() -> Parser:
     on(p, "the task to measure on (default: that of each run; needed for controllers)")
     p.add_argument("--certificates", nargs="+", default=None, help="names (default: the sampled)")
     each = "fresh starts of each (default 10000; robustness 2000, theorem1 and composition 5000)"
-    p.add_argument("--rollouts", type=int, default=None, help=each)
+    p.add_argument("--rollouts", type=number, default=None, help=each)
     p.add_argument("--confidence", type=float, default=0.999, help="of all claims together")
-    p.add_argument("--seed", type=int, default=0, help="of the starts (default 0)")
-    p.add_argument("--out", type=Path, default=None, help="directory (default RUN/certificate)")
+    p.add_argument("--seed", type=number, default=0, help="of the starts (default 0)")
+    p.add_argument("--out", type=place, default=None, help="directory (default RUN/certificate)")
     p.add_argument("--force", action="store_true", help="overwrite a certificate that is there")
 
     p = verb("recheck", "derive every figure of a certificate again, without JAX")
-    p.add_argument("certificate", type=Path, metavar="CERTIFICATE", help="what certify wrote")
+    p.add_argument("certificate", type=place, metavar="CERTIFICATE", help="what certify wrote")
 
-    p = verb("check-task", "hold a task against the laws that all else relies on", ON_TASK)
+    p = verb(
+        "check-task",
+        "check a task against the laws that training and certificates rely on",
+        ON_TASK,
+    )
     p.add_argument("task", metavar="TASK", help="a name of `marlyap list`, or path/to/file.py:Name")
-    p.add_argument("--seed", type=int, default=0, help="of the episodes looked at (default 0)")
+    p.add_argument("--seed", type=number, default=0, help="of the episodes it plays (default 0)")
 
     p = verb("report", "write one HTML file (and PNGs) about runs", SUBJECT)
-    p.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run directories")
-    p.add_argument("--out", type=Path, default=None, help="HTML file (default in the first run)")
-    p.add_argument("--episodes", type=int, default=500, help="fresh starts (default 500)")
-    p.add_argument("--seed", type=int, default=0, help="of the starts (default 0)")
+    p.add_argument("runs", type=place, nargs="+", metavar="RUN", help="run directories")
+    p.add_argument("--out", type=place, default=None, help="HTML file (default in the first run)")
+    p.add_argument("--episodes", type=number, default=500, help="fresh starts (default 500)")
+    p.add_argument("--seed", type=number, default=0, help="of the starts (default 0)")
     on(p, "the task to measure on (default: that of each run)")
 
     p = verb("watch", "film one episode of a run, as GIF and HTML", SUBJECT)
-    p.add_argument("run", type=Path, metavar="RUN", help="a run directory")
-    p.add_argument("--episode", type=int, default=0, help="which of the evaluation starts")
-    p.add_argument("--seed", type=int, default=0, help="of the starts (default 0)")
+    p.add_argument("run", type=place, metavar="RUN", help="a run directory")
+    p.add_argument("--episode", type=number, default=0, help="which of the evaluation starts")
+    p.add_argument("--seed", type=number, default=0, help="of the starts (default 0)")
     p.add_argument(
-        "--out", type=Path, default=None, help="where to put the film (default: the run)"
+        "--out", type=place, default=None, help="where to put the film (default: the run)"
     )
     on(p, "the task to measure on (default: that of each run)")
 
     p = verb("list", "list tasks, algorithms and controllers, or the fields of one")
-    p.add_argument("name", nargs="?", help="a task or an algorithm: shows its fields")
+    p.add_argument("name", nargs="?", help="what to show: any name in the lists, or file.py:Name")
     return top
 
 

@@ -36,7 +36,7 @@ from marlyap.run import Run, expand
 from marlyap.seeds import stream
 from marlyap.subject import asked, changed
 from marlyap.tasks import TASKS
-from marlyap.trainer import Trainer, schedule_for
+from marlyap.trainer import SCHEDULES, Trainer, schedule_for
 from marlyap.workers import train_all
 
 
@@ -309,17 +309,28 @@ def check_task(args: Namespace, overrides: Overrides) -> Result:
     game = asked(args.task, overrides)
     within("seed", args.seed, 0, 2**31 - 1)
     found = conformance(game, args.seed)
+    broken = [f.law for f in found if f.faults]
+    skipped = [f.law for f in found if f.faults is None]
     if not args.json:
-        table = Table(title=args.task, title_justify="left", show_header=False)
+        table = Table(title=escape(args.task), title_justify="left", show_header=False)
         for f in found:
-            mark = "not looked at" if f.faults is None else "broken" if f.faults else "kept"
+            if f.faults is None:
+                continue
             figures = ", ".join(f"{name} {value:.3g}" for name, value in f.figures.items())
-            text = "\n".join(f.faults or ()) or f.says + (f" ({figures})" if figures else "")
-            table.add_row(f.law, mark, escape(text))
+            text = "\n".join(f.faults) or f.says + (f" ({figures})" if figures else "")
+            table.add_row(f.law, "broken" if f.faults else "kept", escape(text))
+        if skipped:
+            rest = f"{len(skipped)} laws need sound shapes: {', '.join(skipped)}"
+            table.add_row("", "skipped", rest)
         Console().print(table)
-    broken = any(f.faults for f in found)
+        print(
+            f"{args.task}: {len(found) - len(broken) - len(skipped)} of {len(found)} laws kept",
+            end="",
+        )
+        print(f", {len(skipped)} skipped" if skipped else "", end="")
+        print(f"; broken: {', '.join(broken)}." if broken else ".")
     laws = {f.law: {"says": f.says, "faults": f.faults, "figures": f.figures} for f in found}
-    return {"task": args.task, "passes": not broken, "laws": laws}, int(broken)
+    return {"task": args.task, "passes": not broken, "laws": laws}, int(bool(broken))
 
 
 def report(args: Namespace, overrides: Overrides) -> Result:
@@ -360,17 +371,21 @@ def watch(args: Namespace, overrides: Overrides) -> Result:
 
 def listing(args: Namespace, overrides: Overrides) -> Result:
     """What there is, or the fields of one of them."""
+    if overrides:
+        raise UserError(f"--{next(iter(overrides))}: list shows what there is; leave it out.")
     if args.name:
         return fields_of(args.name, args.json), 0
     families: dict[str, dict[str, Any]] = {
         "tasks": TASKS,
         "algorithms": ALGORITHMS,
         "controllers": CONTROLLERS,
+        "certificates": CERTIFICATES,
     }
     result = {
         title: {name: summary(thing) for name, thing in family.items()}
         for title, family in families.items()
     }
+    result["presets"] = dict(PRESET_NOTES)
     if not args.json:
         console = Console()
         for title, members in result.items():
@@ -378,9 +393,16 @@ def listing(args: Namespace, overrides: Overrides) -> Result:
                 title=title, title_justify="left", show_header=False, box=None, padding=(0, 2)
             )
             for name, text in members.items():
-                table.add_row(f"[bold]{name}[/]", text)
+                table.add_row(f"[bold]{escape(name)}[/]", escape(text))
             console.print(table, "")
+        console.print("`marlyap list NAME` shows the fields of each, and `marlyap list schedule`.")
     return result, 0
+
+
+PRESET_NOTES = {
+    "tuned": "what learns best here; every algorithm and schedule as listed",
+    "paper": "section 4 of the paper: plain networks, one environment, 100,000 steps",
+}
 
 
 def summary(thing: Any) -> str:
@@ -409,22 +431,38 @@ def changes(thing: Any, prefix: str = "") -> list[str]:
 
 
 def fields_of(name: str, quiet: bool) -> dict[str, Any]:
-    """Every field of a task or algorithm with its value, for overriding."""
-    family = AbstractGame if name in TASKS else AbstractAlgorithm
-    if name not in TASKS and name not in ALGORITHMS:
-        raise UserError(
-            f"name: there is no task or algorithm '{name}'; "
-            f"{config.suggest(name, [*TASKS, *ALGORITHMS])}"
-        )
-    rows = config.describe(config.load(name, family), config.WORDS[family])
-    table = Table(title=name, title_justify="left")
-    for head in ("option", "value", "meaning"):
-        table.add_column(head)
-    for option, value, note in rows:
-        table.add_row(f"--{option}", value, note)
+    """Every field of what `list` names, or of path/to/file.py:Name, with value and meaning."""
+    rows = rows_of(name)
+    table = Table(title=escape(name), title_justify="left", title_style="bold")
+    table.add_column("option", overflow="fold", min_width=max(len(row[0]) for row in rows))
+    table.add_column("value", overflow="fold")
+    table.add_column("meaning", overflow="fold")
+    for row in rows:
+        table.add_row(*map(escape, row))
     if not quiet:
         Console().print(table)
-    return {f"--{option}": {"value": value, "meaning": note} for option, value, note in rows}
+    return {option: {"value": value, "meaning": note} for option, value, note in rows}
+
+
+def rows_of(name: str) -> list[tuple[str, str, str]]:
+    """(option or field, value, meaning) of whatever has this name."""
+    dotted = lambda obj, part: [(f"--{o}", v, m) for o, v, m in config.describe(obj, part)]
+    for table, family in ((TASKS, AbstractGame), (ALGORITHMS, AbstractAlgorithm)):
+        if name in table:
+            return dotted(table[name], config.WORDS[family])
+    if name in ("schedule", *PRESETS):
+        return dotted(SCHEDULES["tuned" if name == "schedule" else name], "schedule")
+    if name in CONTROLLERS:
+        return config.describe_class(CONTROLLERS[name]) or [("(no gains)", "", "")]
+    if name in CERTIFICATES:
+        return [(o.lstrip("."), v, m) for o, v, m in config.describe(CERTIFICATES[name], "")]
+    if ":" not in name and not name.endswith(".py"):
+        there = [*TASKS, *ALGORITHMS, *CONTROLLERS, *CERTIFICATES, *PRESETS, "schedule"]
+        raise UserError(f"name: nothing is called '{name}'; {config.suggest(name, there)}")
+    try:
+        return dotted(config.load(name, AbstractGame), "task")
+    except config.NotOfThatKind:
+        return dotted(config.load(name, AbstractAlgorithm), "algorithm")
 
 
 def demo(args: Namespace, overrides: Overrides) -> Result:

@@ -50,10 +50,12 @@ class Certificate(eqx.Module):
 class Lyapunov(AbstractConstraint):
     """Algorithm 2's term `weight * Delta L` in J_pi, with L learnt beside it."""
 
-    reading: Literal["han", "literal", "hinge", "score", "critic"] = "han"
+    reading: Literal["han", "literal", "hinge", "score", "critic"] = (
+        "han"  # how Delta L is read (see above)
+    )
     function: Literal["squares", "norm"] = "squares"  # L(s, a) sum of squares, or V(s) norm-like
     horizon: int = 10  # T of L_target, in steps
-    target: Literal["rollout", "hold_last", "bootstrap", "discounted"] = "rollout"
+    target: Literal["rollout", "hold_last", "bootstrap", "discounted"] = "rollout"  # what L learns
     discount: float = 0.95  # of the target `discounted`
     decrease: float = 0.1  # L must fall by this share of the cost
     weight: float | None = None  # of Delta L in J_pi; None: learnt, in [floor, 1]
