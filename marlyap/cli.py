@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from marlyap.cache import enable_cache
-from marlyap.errors import UserError, explained
+from marlyap.errors import UserError, explained, whole
 
 
 OVERRIDES = """
@@ -108,12 +108,9 @@ class Once(argparse.Action):
 def number(text: str) -> int:
     """A whole number, also as 1e5."""
     try:
-        plain = float(text.replace("_", ""))
-        if plain.is_integer():
-            return int(text) if text.lstrip("+-").isdigit() else int(plain)
-    except (ValueError, OverflowError):
-        pass
-    raise argparse.ArgumentTypeError(f"'{text}' is not a whole number")
+        return whole(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number") from None
 
 
 def place(text: str) -> Path:
@@ -339,7 +336,7 @@ def exit_interrupted(*_: object) -> NoReturn:
 def tell_interrupted() -> None:
     """Say what an interrupt left behind."""
     store = sys.modules.get("marlyap.store")
-    wrote = store is not None and store.written
+    wrote = store is not None and bool(store.WRITTEN)
     what = "the files written until now are complete" if wrote else "nothing was written"
     with suppress(OSError):
         os.write(2, f"\nmarlyap: interrupted; {what}.\n".encode())

@@ -25,7 +25,7 @@ from marlyap.algorithms import ALGORITHMS
 from marlyap.constraint import AbstractConstraint
 from marlyap.constraints import CONSTRAINTS
 from marlyap.dynamics import DYNAMICS, AbstractDynamics
-from marlyap.errors import UserError, first_line, raised_at
+from marlyap.errors import UserError, first_line, raised_at, whole
 from marlyap.game import AbstractGame
 from marlyap.tasks import TASKS
 from marlyap.trainer import Schedule
@@ -109,7 +109,7 @@ def _annotated(cls: type) -> None:
                 kind = type(value).__name__
                 shown = repr(value) if not isinstance(value, eqx.Module) else f"{kind}()"
                 raise UserError(
-                    f"{cls.__name__}: {name} = {shown} needs a type: {name}: {kind} = {shown}"
+                    f"{cls.__name__}: {name} = {shown} needs a type: {name}: {kind} = {shown}."
                 )
 
 
@@ -209,7 +209,10 @@ def build(data: Any, allowed: Mapping[str, type], where: str) -> Any:
         raise UserError(f"{where}: expected an object with a 'kind'; the file may be damaged.")
     cls = allowed.get(data["kind"])
     if cls is None:
-        raise UnknownCode(f"{where}: '{data['kind']}' is not part of marlyap")
+        raise UnknownCode(
+            f"{where}: '{data['kind']}' is not part of marlyap; if it is your own code, name it "
+            f"with --{where.split('.')[0]} path/to/file.py:{data['kind']}."
+        )
     hints, values = _hints(cls), {}
     for name, value in data.items():
         if name == "kind":
@@ -318,17 +321,6 @@ def _parse_as(text: str, kind: Any) -> Any:
     if kind in FAMILIES and text in FAMILIES[kind]:
         return FAMILIES[kind][text]
     raise ValueError(text)
-
-
-def whole(text: str) -> int:
-    """A whole number, also as 1e5 or 100_000. Raises ValueError for any other."""
-    plain = text.replace("_", "")
-    with suppress(ValueError):
-        return int(plain)
-    number = float(plain)
-    if not number.is_integer():  # infinite and NaN included
-        raise ValueError(text)
-    return int(number)
 
 
 def _finite(value: float) -> float:

@@ -1,6 +1,7 @@
 """What the user can correct, said in one sentence."""
 
 import inspect
+import re
 import sysconfig
 from pathlib import Path
 from types import FrameType
@@ -30,6 +31,14 @@ def within(
     if not (low < value if open else low <= value) or not value <= high:
         least = f"more than {low:g}" if open else f"{low:g}"
         raise UserError(f"{name}: {value} is out of range; take {least} to {high:g}.")
+
+
+def whole(text: str) -> int:
+    """A whole number, also as 1e5 or 100_000. Raises ValueError for any other text."""
+    plain = text.replace("_", "")
+    if re.fullmatch(r"[+-]?\d+(\.\d+)?[eE]\+?\d{1,2}", plain) and float(plain).is_integer():
+        return int(float(plain))
+    return int(plain)
 
 
 def explained(error: BaseException) -> str | None:

@@ -152,8 +152,9 @@ class Run:
                 made = config.build(about[part], allowed, part)
             except config.UnknownCode as error:
                 file = typed if ":" in typed else f"path/to/file.py:{about[part]['kind']}"
+                what = str(error).partition("; ")[0]
                 raise UserError(
-                    f"{error}; if it is your own code, name it with --{part} {file}."
+                    f"{what}; if it is your own code, name it with --{part} {file}."
                 ) from None
             now = config.code_of(made, typed)
             if now and code["sha256"] not in (None, now["sha256"]):

@@ -64,7 +64,7 @@ Arrays = Mapping[str, Any]  # of whatever np.asarray takes, JAX's arrays too
 Table = Mapping[str, Mapping[str, Any]]
 
 
-written = False  # whether this process has put a file in place
+WRITTEN: list[Path] = []  # what this process has put in place
 
 
 class CorruptError(UserError):
@@ -523,9 +523,8 @@ def _explained(path: Path) -> Iterator[None]:
 
 
 def _replace(scratch: Path, path: Path) -> None:
-    global written
     os.replace(scratch, path)
-    written = True
+    WRITTEN.append(path)
     _sync(path.parent)
 
 
@@ -557,13 +556,12 @@ def _check_free(directory: Path, replace: bool) -> None:
 
 def _install(scratch: Path, directory: Path) -> None:
     """Rename into place. Between the two renames the old directory is the `.old` beside it."""
-    global written
     old = _scratch(directory, "old")
     try:
         with suppress(FileNotFoundError):
             os.rename(directory, old)
         os.rename(scratch, directory)
-        written = True
+        WRITTEN.append(directory)
     except BaseException:
         with suppress(OSError):
             os.rename(old, directory)

@@ -98,7 +98,7 @@ class Lyapunov(AbstractConstraint):
 
     def fits(self, agents):
         for i in self.agents:
-            within("agents", i, 0, agents - 1)
+            within("--algorithm.constraint.agents", i, 0, agents - 1)
 
     def init(self, shape, key):
         make = LyapunovNet if self.function == "squares" else NormNet
