@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import marlyap.recheck
-import marlyap.replica
+import marlyap.recheck.checker
+import marlyap.recheck.world
 import marlyap.threefry
 from marlyap import store
 from marlyap.certificate import start_of
@@ -29,8 +29,8 @@ from marlyap.identity import named_arrays, plain
 from marlyap.lyapunov_function import Norm, Quadratic
 from marlyap.nets import Actors, Greedy, NormNet, Shape
 from marlyap.perturb import Perturbed, traced
-from marlyap.recheck import lower, order, recheck
-from marlyap.replica import Rejected, Replica
+from marlyap.recheck.checker import lower, order, recheck
+from marlyap.recheck.world import Rejected, Replica
 from marlyap.rollout import Decentralised, rollout
 from marlyap.statistics import lower_bound, quantile_upper_bound
 from marlyap.tasks.rendezvous import Rendezvous
@@ -370,7 +370,11 @@ def test_its_bounds_are_the_exact_ones(k, n):
 
 def test_it_is_short_enough_to_be_read():
     """Fewer than 300 lines to judge, and its world and its random numbers beside it."""
-    for module, most in ((marlyap.recheck, 300), (marlyap.replica, 200), (marlyap.threefry, 60)):
+    for module, most in (
+        (marlyap.recheck.checker, 300),
+        (marlyap.recheck.world, 200),
+        (marlyap.threefry, 60),
+    ):
         assert 30 < len(Path(module.__file__).read_text().splitlines()) < most
 
 

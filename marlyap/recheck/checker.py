@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from marlyap import store
-from marlyap.replica import KNOWN, Rejected, Replica, agree
+from marlyap.recheck.world import KNOWN, Rejected, Replica, agree
 from marlyap.threefry import fold, normal, uniform
 
 
