@@ -20,6 +20,7 @@ from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.identity import plain
 from marlyap.lyapunov_function import AbstractLyapunov
+from marlyap.perturb import Perturbed
 from marlyap.rollout import Controller, finite, rollout, until
 from marlyap.seeds import Purpose, stream
 from marlyap.statistics import lower_bound, trials_needed
@@ -49,6 +50,31 @@ class Verdict:
     def as_dict(self) -> dict[str, Any]:
         """Plain JSON values; what is not finite is null."""
         return plain(dataclasses.asdict(self))
+
+
+def percent(share: float, up: bool = False) -> str:
+    """A share as "99.87 %", rounded so that "at least" (or, `up`, "at most") stays true of it."""
+    whole = math.ceil(1e4 * share - 1e-6) if up else math.floor(1e4 * share + 1e-6)
+    return f"{whole / 100:.2f} %"
+
+
+def until_step(steps: int, dt: float) -> str:
+    """How far a finite rollout saw, such as "until step 80 (8 s)"."""
+    return f"until step {steps} ({steps * dt:g} s)"
+
+
+def sentence(verdict: Verdict) -> str:
+    """The claim, what was asked, what was shown, and whether that is enough.
+
+    A claim that fails for another reason than the share says which, and is not "not reached".
+    """
+    asked, shown = verdict.figures.get("share_asked"), verdict.bound
+    said = f"{verdict.name}: {verdict.claim}"
+    if asked is None or shown is None or verdict.holds != (shown >= asked):
+        return f"{said}: {'holds' if verdict.holds else 'does not hold'}."
+    sure = "" if verdict.confidence is None else f" (confidence {percent(verdict.confidence)})"
+    answer = "reached" if verdict.holds else "not reached"
+    return f"{said}. Asked {100 * asked:g} %, shown {percent(shown)}{sure}: {answer}."
 
 
 class Judgement(eqx.Module):
@@ -214,6 +240,20 @@ def share_of(
         "worst": worst_of(game, seed, "certify", found),
     }
     return bound, shown, fields
+
+
+def arrival(game: AbstractGame) -> str:
+    """`game.success` in words: the one definition of success, or the one that a task has instead."""
+    while isinstance(game, Perturbed):
+        game = game.inner
+    if type(game).success is AbstractGame.success:
+        return arrived(game.radius)
+    return f"success as {type(game).__name__}.success defines it"
+
+
+def arrived(radius: float) -> str:
+    """Success of a game that replaces nothing."""
+    return f"every agent within {radius:g} m of its goal"
 
 
 def scope(game: AbstractGame, steps: int, disturbance: str = "none") -> dict[str, Any]:

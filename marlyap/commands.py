@@ -18,7 +18,7 @@ from rich.table import Table
 from marlyap import config, film, store
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.algorithms import ALGORITHMS, PRESETS
-from marlyap.certificate import Verdict
+from marlyap.certificate import Verdict, sentence
 from marlyap.certificates import CERTIFICATES
 from marlyap.certify import certify, save
 from marlyap.conformance import conformance
@@ -266,11 +266,13 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
         chosen[name] = dataclasses.replace(c, rollouts=args.rollouts) if several else c  # pyright: ignore
     V = cost_sum(game, controller, stream(args.seed, "calibrate"))
     if V.ball > game.radius:
-        say(f"V counts what lies beyond {V.ball:g} m: so far this strays from the target itself.")
+        say(
+            f"V ignores errors below {V.ball:g} m: started on the target, this controller drifts "
+            "that far."
+        )
 
     def tell(verdict: Verdict) -> None:
-        mark = "holds" if verdict.holds else "does not hold"
-        (say if args.json else print)(f"[{verdict.evidence}] {verdict.claim}: {mark}.")
+        (say if args.json else print)(f"[{verdict.evidence}] {sentence(verdict)}")
 
     result = certify(game, controller, chosen, args.seed, args.confidence, V=V, tell=tell)
     save(out, result, game, controller, V, replace=args.force)

@@ -25,6 +25,11 @@ class AbstractLyapunov(eqx.Module):
 
     @property
     @abc.abstractmethod
+    def meaning(self) -> str:
+        """What V is, in words: "V, <meaning>" stands in the claims about it."""
+
+    @property
+    @abc.abstractmethod
     def beyond(self) -> int:
         """How many steps past a state `along` has to see."""
 
@@ -54,6 +59,10 @@ class CostSum(AbstractLyapunov):
     ball: float = 0.0  # rho (m)
 
     @property
+    def meaning(self):
+        return f"the sum of the next {self.T} costs beyond {self.ball:g} m"
+
+    @property
     def beyond(self):
         return self.T
 
@@ -72,6 +81,10 @@ class Quadratic(AbstractLyapunov):
 
     P: Float[Array, "error error"]
     ball: float = 0.0
+
+    @property
+    def meaning(self):
+        return "a quadratic form in the errors"
 
     @property
     def beyond(self):
@@ -107,6 +120,10 @@ class Approach(AbstractLyapunov):
     ball: float = 0.0
 
     @property
+    def meaning(self):
+        return "the distances and headings to the goal and the gaps to the desired speeds"
+
+    @property
     def beyond(self):
         return 0
 
@@ -136,6 +153,10 @@ class Norm(AbstractLyapunov):
     ball: float = 0.0
 
     @property
+    def meaning(self):
+        return "a trained network that is zero on the target set"
+
+    @property
     def beyond(self):
         return 0
 
@@ -155,6 +176,10 @@ class ActionValue(AbstractLyapunov):
     net: LyapunovNet
     controller: Controller
     ball: float = 0.0
+
+    @property
+    def meaning(self):
+        return "the learnt L(s, mu(s))"
 
     @property
     def beyond(self):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap.certificate import AbstractCertificate, start_of
+from marlyap.certificate import AbstractCertificate, Verdict, percent, sentence, start_of
 from marlyap.certificates import CERTIFICATES, bounds
 from marlyap.certificates.basin import Basin, largest_level
 from marlyap.certificates.closed_form import ClosedForm
@@ -213,7 +213,8 @@ def test_a_ball_is_taken_that_the_controller_keeps():
     beside = Straying(jnp.asarray(1.1 * radius))
     result = certified(POINT, beside)
     assert result["V"]["ball"] == 2 * radius
-    assert "beyond 0.2 m" in result["verdicts"]["decrease"]["claim"]
+    claim = result["verdicts"]["decrease"]["claim"]
+    assert "V, the sum of the next 20 costs beyond 0.2 m, falls" in claim
     assert not result["verdicts"]["reach"]["holds"]
 
 
@@ -259,6 +260,38 @@ def test_a_result_is_json_and_repeats(tmp_path):
     save(tmp_path / "c", first, POINT, Scripted())
     with pytest.raises(UserError, match="not the one"):
         save(tmp_path / "d", first, POINT, Scripted(spin=jnp.asarray(1.0)))
+
+
+def test_a_sentence_says_what_was_asked_and_what_was_shown():
+    """The claim is true whatever was asked: what fails is the share asked for."""
+    verdict = Verdict("reach", "at least 95.22 % of starts arrive", "statistical", False, 0.95229,
+                      0.99983, {}, figures={"share_asked": 0.98})  # fmt: skip
+    said = "Asked 98 %, shown 95.22 % (confidence 99.98 %): not reached."
+    assert sentence(verdict) == f"reach: at least 95.22 % of starts arrive. {said}"
+    better = dataclasses.replace(verdict, bound=0.9812, holds=True)
+    assert sentence(better).endswith("Asked 98 %, shown 98.12 % (confidence 99.98 %): reached.")
+    other = dataclasses.replace(better, holds=False)  # for another reason than the share
+    assert sentence(other).endswith("arrive: does not hold.")
+    none = dataclasses.replace(better, figures={})
+    assert sentence(none) == "reach: at least 95.22 % of starts arrive: holds."
+    # 0.98 is shown in full, and what is just below it is not called 98 %.
+    assert [percent(x) for x in (0.98, 0.97999, 0.57, 1.0)] == [
+        "98.00 %",
+        "97.99 %",
+        "57.00 %",
+        "100.00 %",
+    ]
+    assert percent(0.12341, up=True) == "12.35 %"
+
+
+def test_every_claim_says_until_when_and_nothing_of_later():
+    claims = {name: v["claim"] for name, v in certified(POINT, Scripted())["verdicts"].items()}
+    assert claims["reach"].endswith("% of starts end with every agent within 0.1 m of its goal "
+                                    "at 4 s")  # fmt: skip
+    assert "until step 80 (8 s)" in claims["reach-and-stay"]
+    assert "by step 40 (4 s)" in claims["decrease"]
+    assert all("until step 40 (4 s)" in claims[name] for name in ("contraction", "quantiles"))
+    assert not any("share" in claim for claim in claims.values())
 
 
 def test_levels_and_failures_by_hand():

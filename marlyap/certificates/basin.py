@@ -9,14 +9,34 @@ from marlyap.certificate import (
     Evidence,
     Judgement,
     Verdict,
+    arrival,
     at_least,
     judged,
+    percent,
     scope,
+    until_step,
     worst_of,
 )
 from marlyap.certificates.reach import ReachAndStay
 from marlyap.rollout import until
 from marlyap.statistics import bonferroni, clopper_pearson, trials_needed
+
+
+def claim(
+    bound: float,
+    V: str,
+    level: float,
+    arrived: str,
+    horizon: int,
+    stay: int,
+    dt: float,
+    mass: float,
+) -> str:
+    return (
+        f"at least {percent(bound)} of the starts with V <= {level:.4g} have {arrived} at every "
+        f"step from {horizon * dt:g} s {until_step(horizon + stay, dt)}, and at least "
+        f"{percent(mass)} of all starts are such, with V {V}"
+    )
 
 
 class Basin(AbstractCertificate):
@@ -50,9 +70,16 @@ class Basin(AbstractCertificate):
         needed = trials_needed(1 - self.share, each)
         return Verdict(
             name="basin",
-            claim=f"from at least a share {bound:.4f} of the starts with V <= {level:.4g} every "
-            f"agent is within {game.radius:g} m from {game.horizon * game.dt:g} s and stays for "
-            f"{self.stay * game.dt:g} s; they are at least a share {mass.low:.4f} of the starts",
+            claim=claim(
+                bound,
+                V.meaning,
+                level,
+                arrival(game),
+                game.horizon,
+                self.stay,
+                game.dt,
+                float(mass.low),
+            ),
             evidence=self.evidence,
             holds=shown,
             bound=bound,

@@ -16,9 +16,19 @@ from marlyap.certificate import (
     Verdict,
     enough,
     judged,
+    percent,
     share_of,
+    until_step,
 )
 from marlyap.game import AbstractGame
+
+
+def claim(bound: float, rho: float, farthest: float, steps: int, dt: float) -> str:
+    return (
+        f"at least {percent(bound)} of starts obey the fitted inequalities between neighbours "
+        f"(spectral radius {rho:.3f}) {until_step(steps, dt)}; they pull every distance towards "
+        f"at most {farthest:.3g} m as long as they are obeyed, and nothing is said of later steps"
+    )
 
 
 class Composition(AbstractCertificate):
@@ -64,9 +74,7 @@ class Composition(AbstractCertificate):
         within = game.radius if self.within is None else self.within
         return Verdict(
             name="composition",
-            claim=f"along at least a share {bound:.4f} of the rollouts the agents' functions obey "
-            f"inequalities with spectral radius {rho:.3f}, by which all distances would end "
-            f"below {farthest:.3g} m",
+            claim=claim(bound, rho, farthest, steps, game.dt),
             **fields,
             holds=bool(shown and rho < 1 and farthest <= within),
             figures={

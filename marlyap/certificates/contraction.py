@@ -14,9 +14,25 @@ from marlyap.certificate import (
     Verdict,
     enough,
     judged,
+    percent,
     share_of,
+    until_step,
 )
 from marlyap.statistics import lower_bound
+
+
+def claim(bound: float, beta: float, T: int, c_min: float, least: float, steps: int, dt: float):
+    """In words, for any beta: one that is not positive is no contraction, but a bound on growth."""
+    of = f"at least {percent(bound)} of the starts whose cost exceeds {c_min:g}"
+    when = f"over every {T} steps that begin above {c_min:g}, {until_step(steps, dt)}"
+    if beta == -math.inf:
+        return f"the cost does not contract: all that is known of {of} is that it stays finite"
+    if beta <= 0:
+        return (
+            f"the cost does not contract: on {of} it grows by up to {percent(-beta, True)} {when}"
+        )
+    little = f", which is less than the {100 * least:g} % asked" if beta < least else ""
+    return f"on {of} the cost falls by at least {percent(beta)}{little} {when}"
 
 
 class Contraction(AbstractCertificate):
@@ -53,9 +69,7 @@ class Contraction(AbstractCertificate):
         asked = int(np.sum(found.figures["windows"] > 0))
         return Verdict(
             name="contraction",
-            claim=f"from at least a share {bound:.4f} of the starts the cost contracts by "
-            f"{max(beta, 0.0):.4f} over every {self.T} steps that begin above "
-            f"{self.floor(game):g} m",
+            claim=claim(bound, beta, self.T, self.floor(game), self.least, H, game.dt),
             **fields,
             holds=shown and beta >= self.least and asked > 0,
             figures={

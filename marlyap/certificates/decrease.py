@@ -11,10 +11,23 @@ from marlyap.certificate import (
     Evidence,
     Judgement,
     Verdict,
+    arrival,
     enough,
     judged,
+    percent,
     share_of,
+    until_step,
 )
+
+
+def claim(
+    bound: float, V: str, beta: float, ball: float, arrived: str, steps: int, dt: float
+) -> str:
+    return (
+        f"at least {percent(bound)} of the starts outside the ball come to {arrived} "
+        f"{until_step(steps, dt).replace('until', 'by')}, and in every step before that V, {V}, "
+        f"falls by at least {beta:g} of the mean distance beyond {ball:g} m"
+    )
 
 
 class Decrease(AbstractCertificate):
@@ -42,9 +55,7 @@ class Decrease(AbstractCertificate):
         steps, bad = (float(np.nansum(found.figures[name])) for name in ("steps", "violations"))
         return Verdict(
             name="decrease",
-            claim=f"from at least a share {bound:.4f} of the starts V falls by {self.beta:g} of "
-            f"the mean distance beyond {V.ball:g} m in every step until the ball of "
-            f"{game.radius:g} m is entered, which happens within {H * game.dt:g} s",
+            claim=claim(bound, V.meaning, self.beta, V.ball, arrival(game), H, game.dt),
             **fields,
             holds=holds,
             figures={

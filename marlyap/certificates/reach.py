@@ -10,10 +10,24 @@ from marlyap.certificate import (
     Evidence,
     Judgement,
     Verdict,
+    arrival,
     enough,
     judged,
+    percent,
     share_of,
+    until_step,
 )
+
+
+def claim(bound: float, arrived: str, seconds: float) -> str:
+    return f"at least {percent(bound)} of starts end with {arrived} at {seconds:g} s"
+
+
+def claim_stay(bound: float, arrived: str, horizon: int, steps: int, dt: float) -> str:
+    return (
+        f"at least {percent(bound)} of starts have {arrived} at every step from {horizon * dt:g} s "
+        f"{until_step(steps, dt)}"
+    )
 
 
 class Reach(AbstractCertificate):
@@ -36,8 +50,7 @@ class Reach(AbstractCertificate):
         bound, holds, fields = share_of(self, game, seed, found, H)
         return Verdict(
             name="reach",
-            claim=f"from at least a share {bound:.4f} of the starts every agent is within "
-            f"{game.radius:g} m of its goal at {H * game.dt:g} s",
+            claim=claim(bound, arrival(game), H * game.dt),
             **fields,
             holds=holds,
             figures={"share_asked": self.share},
@@ -70,9 +83,7 @@ class ReachAndStay(AbstractCertificate):
         bound, holds, fields = share_of(self, game, seed, found, steps)
         return Verdict(
             name="reach-and-stay",
-            claim=f"from at least a share {bound:.4f} of the starts every agent is within "
-            f"{game.radius:g} m of its goal from {game.horizon * game.dt:g} s at the latest "
-            f"until {steps * game.dt:g} s",
+            claim=claim_stay(bound, arrival(game), game.horizon, steps, game.dt),
             **fields,
             holds=holds,
             figures={"share_asked": self.share, "stay_steps": self.stay},

@@ -9,9 +9,11 @@ from marlyap.certificate import (
     AbstractCertificate,
     Evidence,
     Verdict,
+    arrival,
     at_least,
     enough,
     judged,
+    percent,
     scope,
     worst_of,
 )
@@ -20,6 +22,15 @@ from marlyap.game import AbstractGame
 from marlyap.perturb import Perturbed, edge_to_cut, follower_to_lose, traced
 from marlyap.rollout import Controller
 from marlyap.statistics import bonferroni
+
+
+def claim(bound: float, count: int, arrived: str, seconds: float, without: dict[str, str]) -> str:
+    """`without` says for each perturbation that could not be applied why."""
+    left = "; ".join(f"{name}, because {why}" for name, why in without.items())
+    return (
+        f"under each of {count} perturbations{f' (without: {left})' if left else ''} at least "
+        f"{percent(bound)} of starts end with {arrived} at {seconds:g} s"
+    )
 
 
 class Robustness(AbstractCertificate):
@@ -55,9 +66,7 @@ class Robustness(AbstractCertificate):
         least = min(p["bound"] for p in points)
         return Verdict(
             name="robustness",
-            claim=f"under each of {len(points)} perturbations, from at least a share {least:.4f} "
-            f"of the starts every agent is within {game.radius:g} m of its goal at "
-            f"{game.horizon * game.dt:g} s",
+            claim=claim(least, len(points), arrival(game), game.horizon * game.dt, {}),
             evidence=self.evidence,
             holds=all(p["holds"] for p in points),
             bound=least,

@@ -15,6 +15,7 @@ from marlyap.certificate import (
     at_least,
     enough,
     judged,
+    percent,
     scope,
     worst_of,
 )
@@ -23,6 +24,13 @@ from marlyap.game import AbstractGame
 from marlyap.layout import grad
 from marlyap.lyapunov_function import Norm
 from marlyap.rollout import Controller
+
+
+def claim(bound: float, V: str) -> str:
+    return (
+        f"at least {percent(bound)} of the states met outside the ball, one of each rollout, "
+        f"satisfy condition (13) for V, {V}; the theorem asks for all of them"
+    )
 
 
 class Theorem1(AbstractCertificate):
@@ -70,8 +78,7 @@ class Theorem1(AbstractCertificate):
         found = type(found)(fine, np.where(np.isnan(excess), np.inf, excess), fig)
         return Verdict(
             name="theorem1",
-            claim=f"at least a share {bound:.4f} of the tuples met outside the ball satisfies "
-            "condition (13); the theorem asks for all of them",
+            claim=claim(bound, V.meaning),
             evidence=self.evidence if l == constants.get("spectral") else "observed",
             holds=shown,
             bound=bound,
