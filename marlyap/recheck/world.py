@@ -1,15 +1,19 @@
 """The world of a certificate once more, in NumPy and float64: starts, steps, sights, networks, V.
 
-Written apart from the game, the rollout and the networks, so that a mistake in those shows.
+Written apart from the game, the graph, the rollout and the networks, so that a mistake in those
+shows.
 """
 
+import json
+import math
+import re
 import zlib
 from typing import Any
 
 import numpy as np
 
-from marlyap import graph as graphs
 from marlyap.errors import UserError
+from marlyap.recheck.reader import Arrays, Rejected, agree, record
 from marlyap.threefry import fold, normal, uniform
 
 
@@ -21,45 +25,109 @@ KNOWN = {
     "SingleIntegrator": (2, slice(0, 2)),
 }
 MOST = 5 * 10**7  # agent-steps of the longest set of rollouts that is played: 2 GB
+SCOPE = (
+    "recheck knows rendezvous on a fixed graph by Euler steps, driven by a trained policy's mean"
+)
+WHOLE, NUMBER, FLAG, TEXT, LIST, OBJECT = (int,), (int, float), (bool,), (str,), (list,), (dict,)
+GAME = dict(kind=TEXT, agents=WHOLE, leaders=LIST, graph=TEXT, radius=NUMBER, size=NUMBER)
+GAME |= dict(headings=FLAG, rest_weight=NUMBER, dt=NUMBER, horizon=WHOLE, dynamics=OBJECT)
+DYNAMICS = dict(kind=TEXT, limits=LIST, integrator=TEXT)
+LAYER = {"kind": "Layer", "weight": None, "bias": None}
+V_KEYS = {
+    "CostSum": dict(kind=TEXT, controller=OBJECT, T=WHOLE, ball=NUMBER),
+    "Quadratic": dict(kind=TEXT, P=(type(None),), ball=NUMBER),
+    "Norm": dict(kind=TEXT, net=OBJECT, ball=NUMBER),
+}
 
 
-class Rejected(UserError):
-    """The file does not say what its own starts and arrays give."""
-
-
-def agree(what: str, found: Any, said: Any) -> None:
-    if found != said:
-        raise Rejected(f"certificate: {what} is {found}, not {said} as the file says.")
-
-
-class Replica:
+class World:
     """The closed loop of a rendezvous, with a change to the game where one is asked for."""
 
-    def __init__(self, meta: dict[str, Any], arrays: dict[str, np.ndarray]):
+    def __init__(self, meta: dict[str, Any], arrays: Arrays):
         self.game, self.controller, self.V = meta["game"], meta["controller"], meta["V"]
-        self.arrays, self.cache, self.seed = arrays, {}, meta["seed"]
-        model = self.game.get("dynamics", {})
-        self.kind, self.limits = model.get("kind"), np.array(model.get("limits", []))
-        self.turns = "Unicycle" in str(self.kind)
-        world = self.game["kind"], self.controller["kind"], model.get("integrator")
-        world += self.kind in KNOWN and self.controller["policy"]["kind"], self.game["graph"][:4]
-        if world[:4] != ("Rendezvous", "Decentralised", "euler", "Greedy") or world[4] == "disk":
-            known = "rendezvous on a fixed graph by Euler steps with a trained policy's mean"
-            raise UserError(f"recheck: only {known} is known, not {world} of {self.kind}.")
-        agree("the game that the policy sees", self.controller["game"], self.game)
-        agree("the policy in V", self.V.get("controller", self.controller), self.controller)
-        self.linked = graphs.adjacency(self.game["graph"], self.game["agents"])
-        self.slots = graphs.neighbours(self.linked, graphs.room(self.game["graph"]))
+        self.arrays, self.used, self.cache, self.seed = arrays, {"controller/words"}, {}, meta["seed"]
+        self.known()
+        record("the game", self.game, GAME)
+        model = self.game["dynamics"]
+        record("the dynamics", model, DYNAMICS)
+        self.kind, self.limits = model["kind"], np.array(model["limits"], float)
+        self.turns = "Unicycle" in self.kind
+        self.linked = adjacency(self.game["graph"], self.game["agents"])
+        self.slots = places(self.linked, self.game["graph"])
         self.leads = np.isin(np.arange(len(self.slots)), self.game["leaders"])
+        self.layers = self.network("controller/policy.pi.net", self.controller["policy"]["pi"]["net"])
+        pi = {"kind": "Actors", "net": self.controller["policy"]["pi"]["net"]}
+        pi |= {"shared": self.controller["policy"]["pi"]["shared"] is True, "du": len(self.limits)}
+        whole = {"kind": "Decentralised", "policy": {"kind": "Greedy", "pi": pi}, "game": self.game}
+        agree("what the controller is made of", whole, self.controller)
+        text = json.dumps(self.controller, sort_keys=True).encode()
+        if arrays["controller/words"].tobytes() != text:
+            raise Rejected("certificate: the policy that was hashed is another than the one named.")
+        self.lyapunov()
+        for name in sorted(arrays.keys() - self.used):
+            raise Rejected(f"certificate: the array {name!r} belongs to nothing in it.")
 
-    def keys(self, episodes: Any) -> tuple[np.ndarray, np.ndarray]:
-        """One stream per episode of those that certify."""
+    def known(self) -> None:
+        """Raise UserError naming the first thing that this checker does not know."""
+        model = self.game.get("dynamics", {})
+        policy = self.controller.get("policy", {})
+        for what, name, those in (
+            ("the game", self.game.get("kind"), ("Rendezvous",)),
+            ("the dynamics", model.get("kind"), (*KNOWN,)),
+            ("the integrator", model.get("integrator"), ("euler",)),
+            ("the controller", self.controller.get("kind"), ("Decentralised",)),
+            ("the policy", policy.get("kind") if isinstance(policy, dict) else None, ("Greedy",)),
+        ):
+            if name not in those:
+                raise UserError(f"recheck: {what} {name} is unknown to it; {SCOPE}.")
+        if str(self.game.get("graph")).startswith("disk"):
+            raise UserError(f"recheck: the graph {self.game['graph']} is unknown to it; {SCOPE}.")
+
+    def lyapunov(self) -> None:
+        """Check what V is made of; one that is not known may not be asked about (`values`)."""
+        kind, alike = self.V.get("kind"), {}
+        if kind in V_KEYS:
+            record("V", self.V, V_KEYS[kind])
+        if kind == "CostSum":
+            agree("the policy in V", self.controller, self.V["controller"])
+            alike = {k.replace("/", "/controller.", 1): k for k in self.used - {"controller/words"}}
+            alike = {k.replace("controller/", "V/", 1): v for k, v in alike.items()}
+        elif kind == "Quadratic":
+            self.used |= {"V/P"}
+        elif kind == "Norm":
+            self.net = self.network("V/net.net", self.V["net"]["net"])
+            about = {"kind": "NormNet", "net": self.V["net"]["net"], "slope": self.V["net"]["slope"]}
+            about |= {"errors": 2 + self.motion(np.zeros((1, KNOWN[self.kind][0])))[1].shape[-1]}
+            agree("what V is made of", about, self.V["net"])
+        else:
+            self.used |= {name for name in self.arrays if name.startswith("V/")}
+        for copy, name in alike.items():
+            if self.arrays[copy].tobytes() != self.arrays[name].tobytes():
+                raise Rejected("certificate: V is of another policy than the one it certifies.")
+        self.used |= {*alike}
+
+    def network(self, prefix: str, said: dict[str, Any]) -> list[dict[str, np.ndarray]]:
+        """The layers in float64, of a network that is described as the file has it."""
+        norms = [layer["norm"] for layer in said["layers"]]
+        whole = [LAYER | {"norm": None if norm is None else [None, None]} for norm in norms]
+        agree(f"what {prefix} is made of", {"kind": "MLP", "layers": whole}, said)
+        layers = []
+        for i, norm in enumerate(norms):
+            names = {"W": "weight", "b": "bias"}
+            names |= {} if norm is None else {"gain": "norm.0", "offset": "norm.1"}
+            names = {k: f"{prefix}.layers.{i}.{name}" for k, name in names.items()}
+            self.used |= {*names.values()}
+            layers.append({k: self.arrays[name].astype(float) for k, name in names.items()})
+        return layers
+
+    def keys(self, episodes: Any, purpose: str = "certify") -> tuple[np.ndarray, np.ndarray]:
+        """One stream per episode of those for a purpose."""
         seed = np.zeros(1, np.uint32), np.array([self.seed], np.uint32)
-        return fold(fold(seed, zlib.crc32(b"certify")), np.atleast_1d(episodes))
+        return fold(fold(seed, zlib.crc32(purpose.encode())), np.atleast_1d(episodes))
 
-    def starts(self, episodes: Any) -> tuple[np.ndarray, np.ndarray, Any]:
-        """States [episode, agent, .], goals, and the stream of each episode's disturbances."""
-        key, size = fold(self.keys(episodes), 0), self.game["size"]
+    def starts(self, key: Any) -> tuple[np.ndarray, np.ndarray, Any]:
+        """States [episode, agent, .], goals, and streams of disturbances, from streams of starts."""
+        size = self.game["size"]
         draw = lambda i, *shape: 2.0 * uniform(fold(key, i), *shape) - 1
         x = np.zeros((len(key[0]), len(self.slots), KNOWN[self.kind][0]))
         x[..., :2] = size * draw(0, len(self.slots), 2)
@@ -68,12 +136,24 @@ class Replica:
         goal = np.repeat(size * draw(2, 2)[:, None], len(self.slots), axis=1)
         return x, goal, fold(key, zlib.crc32(b"perturb"))
 
-    def roll(self, n: int, steps: int, change: dict[str, Any]) -> dict[str, Any]:
-        """States [n, steps + 1, agent, .] and distances, from the first n starts."""
-        if (name := (n, steps, repr(change))) not in self.cache:
-            self.bounded(n, steps)
-            self.cache = {name: self.drive(*self.starts(np.arange(n)), steps, change)}
-        return self.cache[name]
+    def roll(
+        self, n: int, steps: int, change: dict[str, Any] | None = None, purpose: str = "certify"
+    ) -> dict[str, Any]:
+        """States [n, steps + 1, agent, .] and distances, from the first n starts.
+
+        Whole horizons are played and kept, so that several certificates share them.
+        """
+        change, H = change or {}, self.game["horizon"]
+        long = math.ceil(steps / H) * H
+        self.bounded(n, long)
+        seen = self.cache.get(purpose) if not change else None
+        if seen is None or seen["x"].shape[0] < n or seen["x"].shape[1] <= steps:
+            begin = self.starts(fold(self.keys(np.arange(n), purpose), 0))
+            seen = self.drive(*begin, long, change)
+            self.cache |= {} if change else {purpose: seen}
+        cut = lambda a: a[:n, : steps + 1]
+        found = {k: cut(v) for k, v in seen.items() if k != "goal"} | {"goal": seen["goal"][:n]}
+        return found | {"sound": found["sound"][:, -1]}
 
     def bounded(self, n: int, steps: int) -> None:
         """Raise Rejected if so many rollouts would fill the memory."""
@@ -103,7 +183,7 @@ class Replica:
                 seen.append(x)
         states = np.stack(seen, axis=1)
         distance = np.linalg.norm(states[..., :2] - goal[:, None], axis=-1) * present
-        sound = np.isfinite(states).all(axis=(1, 2, 3))
+        sound = np.logical_and.accumulate(np.isfinite(states).all(axis=(2, 3)), axis=1)
         return {"x": states, "goal": goal, "distance": distance, "sound": sound}
 
     def step(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -142,17 +222,10 @@ class Replica:
         return np.stack(rows, axis=1)
 
     def act(self, x: np.ndarray, goal: np.ndarray, linked: np.ndarray) -> np.ndarray:
-        obs, layers = self.observe(x, goal, linked), self.layers("controller/policy.pi.net")
-        shared = self.controller["policy"]["pi"]["shared"]
-        pick = lambda i: [{k: w if shared else w[i] for k, w in l.items()} for l in layers]
+        obs, shared = self.observe(x, goal, linked), self.controller["policy"]["pi"]["shared"]
+        pick = lambda i: [{k: w if shared else w[i] for k, w in l.items()} for l in self.layers]
         out = np.stack([forward(pick(i), obs[:, i]) for i in range(x.shape[1])], axis=1)
         return np.tanh(out[..., : out.shape[-1] // 2])
-
-    def layers(self, prefix: str) -> list[dict[str, np.ndarray]]:
-        names = {"W": "weight", "b": "bias", "gain": "norm.0", "offset": "norm.1"}
-        held = [{k: f"{prefix}.layers.{i}.{v}" for k, v in names.items()} for i in range(9)]
-        get = lambda l: {k: self.arrays[v].astype(float) for k, v in l.items() if v in self.arrays}
-        return [get(layer) for layer in held if layer["W"] in self.arrays]
 
     def values(self, seen: dict[str, np.ndarray], time: int) -> np.ndarray:
         """V of the first `time` states of every rollout."""
@@ -165,10 +238,37 @@ class Replica:
         if kind == "Quadratic":
             return np.einsum("...i,ij,...j", e, self.arrays["V/P"].astype(float), e).sum(-1)
         if kind != "Norm":
-            raise UserError(f"recheck: V of kind {kind} is not known.")
-        e, layers = e.reshape(*e.shape[:2], -1), self.layers("V/net.net")
-        change = forward(layers, e) - forward(layers, np.zeros(e.shape[-1]))
+            raise UserError(f"recheck: V of kind {kind} is unknown to it; certify by another V.")
+        e = e.reshape(*e.shape[:2], -1)
+        change = forward(self.net, e) - forward(self.net, np.zeros(e.shape[-1]))
         return np.linalg.norm(change, axis=-1) + self.V["net"]["slope"] * np.linalg.norm(e, axis=-1)
+
+
+def adjacency(graph: str, n: int) -> np.ndarray:
+    """Which pairs of n agents are joined by a fixed graph, written as text."""
+    name, linked = graph.partition("/")[0], np.zeros((n, n), bool)
+    i = np.arange(n)
+    if name == "complete":
+        linked[:] = True
+    elif name == "star":
+        linked[0] = True
+    elif name in ("path", "ring"):
+        linked[i[:-1], i[1:]] = True
+        linked[-1, 0] |= name == "ring"
+    elif name.startswith("geometric:"):
+        p = uniform((np.zeros(1, np.uint32), np.array([n], np.uint32)), n, 2)[0]
+        linked = np.hypot(*(p[:, None] - p[None]).T) < float(name[10:])
+    else:
+        for edge in name.split(","):
+            linked[tuple(int(end) for end in edge.split("-"))] = True
+    return (linked | linked.T) & (i[:, None] != i)
+
+
+def places(linked: np.ndarray, graph: str) -> np.ndarray:
+    """Whom each agent observes [agent, slot], in ascending order; -1 in a slot that is empty."""
+    rows = [np.flatnonzero(row) for row in linked]
+    room = int(graph.partition("/")[2] or max(map(len, rows)))
+    return np.array([np.append(row, np.full(room, -1))[:room] for row in rows]).reshape(-1, room)
 
 
 def frame(h: np.ndarray, v: np.ndarray) -> np.ndarray:
