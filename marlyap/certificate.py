@@ -1,13 +1,14 @@
 """The seam of every certificate: what is claimed, on what evidence, and the worst case found.
 
 A sampled certificate judges whole rollouts from fresh, independent starts: one rollout is one
-trial, and a rollout in which anything is not finite has failed. Bounds are exact (Clopper-Pearson).
+trial, and a rollout in which anything is not finite has failed. A rollout that leaves nothing to
+judge is no trial. Bounds are exact (Clopper-Pearson).
 """
 
 import abc
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
@@ -29,6 +30,7 @@ from marlyap.types import Key, Scalar, State, Trajectory
 
 Evidence = Literal["proved", "statistical", "observed"]
 CHUNK = 500_000  # agent-steps that are in memory at once
+ROUNDING = 1e-5  # of V in float32, relative to its usual size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +85,7 @@ class Judgement(eqx.Module):
     holds: Bool[Array, ""]
     badness: Scalar  # larger is worse; it picks the worst case
     figures: dict[str, Array]
+    asked: Bool[Array, ""] | None = None  # whether there was anything to judge; None: always
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +95,15 @@ class Found:
     holds: np.ndarray
     badness: np.ndarray
     figures: dict[str, np.ndarray]
+    asked: np.ndarray  # whether the rollout is a trial; one that is not finite always is
+    lowest: np.ndarray  # V along the rollout; 0 for a certificate that does not use it
+    largest: np.ndarray
+
+    @property
+    def negative(self) -> int:
+        """Along how many rollouts V is negative, by more than rounding at its usual size."""
+        usual = np.median(self.largest[np.isfinite(self.largest)]) if len(self.largest) else 0.0
+        return int(np.sum(self.lowest < -ROUNDING * usual))
 
 
 class AbstractCertificate(eqx.Module):
@@ -101,11 +113,17 @@ class AbstractCertificate(eqx.Module):
     evidence: eqx.AbstractClassVar[Evidence]
     asks_V: ClassVar[bool] = False  # whether V is part of what is claimed
 
+    def refuse(self, game: AbstractGame, controller: Controller, V: AbstractLyapunov) -> None:
+        """Raise UserError where this certificate is not about such a game, controller or V."""
+
     @abc.abstractmethod
     def check(
         self, game: AbstractGame, controller: Controller, V: AbstractLyapunov, seed: int
     ) -> Verdict:
-        """Judge one controller. It does not raise when the controller fails."""
+        """Judge one controller. It does not raise when the controller fails.
+
+        Raises UserError as `refuse` does, and for fields that cannot show what is asked.
+        """
 
 
 # The key is for what a certificate draws itself, such as one time of the rollout.
@@ -132,13 +150,22 @@ def _judge(
     key: Key,
     indices: Any,
     steps: int,
-) -> Judgement:
-    def one(trajectory: Trajectory, index: Array) -> Judgement:
+    uses_V: bool,
+) -> dict[str, Any]:
+    def one(trajectory: Trajectory, index: Array) -> dict[str, Any]:
         trajectory = until(trajectory, steps)
         own = jax.random.fold_in(jax.random.fold_in(key, index), 2)
         found, sound = judge(game, V, trajectory, own), finite(trajectory)
-        badness = jnp.where(sound & ~jnp.isnan(found.badness), found.badness, jnp.inf)
-        return Judgement(found.holds & sound, badness, found.figures)
+        # The last states have too few after them for a V that looks ahead.
+        values = V.along(game, trajectory, steps + 1 - V.beyond) if uses_V else jnp.zeros(1)
+        return {
+            "holds": found.holds & sound,
+            "badness": jnp.where(sound & ~jnp.isnan(found.badness), found.badness, jnp.inf),
+            "figures": found.figures,
+            "asked": jnp.asarray(True) if found.asked is None else found.asked | ~sound,
+            "lowest": jnp.min(values),
+            "largest": jnp.max(jnp.abs(values)),
+        }
 
     return jax.vmap(one)(seen, indices)
 
@@ -152,8 +179,11 @@ def judged(
     purpose: Purpose,
     count: int,
     steps: int,
+    uses_V: bool = False,
 ) -> Found:
     """`judge` of `count` rollouts of `steps` steps, as NumPy arrays.
+
+    With `uses_V` V is also held to V >= 0 in every state of every rollout (`Found.negative`).
 
     They are rolled in chunks, so that memory does not grow with `count`, and for a whole number of
     horizons, so that certificates share what was compiled; the judge sees `steps` steps of it.
@@ -164,9 +194,9 @@ def judged(
     for first in range(0, count, size):
         indices = np.arange(first, first + size)
         seen = _roll(game, controller, key, indices, long)
-        found = _judge(judge, game, V, seen, key, indices, steps)
+        found = _judge(judge, game, V, seen, key, indices, steps, uses_V)
         parts.append(jax.tree.map(np.asarray, found))
-    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *map(vars, parts))
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
     return Found(**joined)
 
 
@@ -221,29 +251,85 @@ def at_least(successes: int, trials: int, share: float, confidence: float) -> tu
     return bound, bound >= share
 
 
-def share_of(
-    certificate: Any, game: AbstractGame, seed: int, found: Found, steps: int
-) -> tuple[float, bool, dict[str, Any]]:
-    """Bound on the share of rollouts that hold, whether it suffices, and a verdict's usual fields.
+def failures_allowed(trials: int, share: float, confidence: float) -> int:
+    """The most failures in `trials` with which the lower bound still reaches `share`."""
+    failures = np.arange(trials + 1)
+    bounds = np.asarray(lower_bound(trials - failures, trials, confidence))
+    return int(np.sum(bounds >= share)) - 1
 
-    The bound is Clopper and Pearson's, at the share and the confidence that `certificate` asks for.
+
+def passing(values: np.ndarray, rollouts: int, share: float, confidence: float) -> float:
+    """The largest level that `values` of one set of rollouts pass, with room for bad luck.
+
+    It is to be tested on `rollouts` fresh ones, of which `share` has to be shown to lie above it.
     """
-    n, k = len(found.holds), int(found.holds.sum())
-    bound, shown = at_least(k, n, certificate.share, certificate.confidence)
-    fields = {
-        "evidence": certificate.evidence,
-        "bound": bound,
-        "confidence": certificate.confidence,
-        "scope": scope(game, steps),
-        "trials": n,
-        "successes": k,
-        "worst": worst_of(game, seed, "certify", found),
-    }
-    return bound, shown, fields
+    allowed = failures_allowed(rollouts, share, confidence)
+    allowed = max(0.0, allowed - 2.5 * math.sqrt(allowed)) / rollouts
+    return float(np.sort(values)[int(allowed * len(values))])
+
+
+def no_lyapunov(V: AbstractLyapunov, *founds: Found) -> str | None:
+    """One sentence if V was negative somewhere, which no Lyapunov function is; else None."""
+    negative, drawn = sum(f.negative for f in founds), sum(len(f.holds) for f in founds)
+    if not negative:
+        return None
+    return f"V is negative at {negative} of {drawn} rollouts, so it is no Lyapunov function"
+
+
+def of_share(
+    certificate: Any,
+    game: AbstractGame,
+    V: AbstractLyapunov,
+    seed: int,
+    found: Found,
+    steps: int,
+    claim: Callable[[float], str],
+    *,
+    name: str,
+    confidence: float | None = None,
+    void: str | None = None,
+    also: bool = True,
+    to_judge: str = "leave something to judge",
+    evidence: Evidence = "statistical",
+    scope: Mapping[str, Any] | None = None,
+    figures: Mapping[str, Any] | None = None,
+) -> Verdict:
+    """The verdict that a share of the trials holds: bound, exact, at the share asked for.
+
+    The trials are the rollouts that leave something to judge. Where they are too few for the share,
+    where V is negative, or where `void` gives another reason, that is the claim instead of
+    `claim(bound)`, nothing is bounded, and the verdict does not hold. It also needs `also`.
+
+    Arguments: certificate, with fields share and confidence; confidence, of this bound, where it is
+    not the certificate's; to_judge, what a trial does, in words; scope and figures, to be added.
+    """
+    each = certificate.confidence if confidence is None else confidence
+    n, k = int(found.asked.sum()), int((found.holds & found.asked).sum())
+    bound, shown = at_least(k, n, certificate.share, each)
+    void = void or no_lyapunov(V, found)
+    needed = trials_needed(1.0 - certificate.share, each)
+    if void is None and n < needed:
+        void = (
+            f"nothing to judge: {n} of {len(found.holds)} rollouts {to_judge}, and at least "
+            f"{needed} are needed to show {100 * certificate.share:g} %"
+        )
+    return Verdict(
+        name=name,
+        claim=claim(bound) if void is None else void,
+        evidence=evidence,
+        holds=void is None and shown and also,
+        bound=bound if void is None else None,
+        confidence=certificate.confidence,
+        scope=limits(game, steps) | dict(scope or {}),
+        trials=n,
+        successes=k,
+        worst=worst_of(game, seed, "certify", found, found.asked) if n else None,
+        figures={"share_asked": certificate.share, "drawn": len(found.holds)} | dict(figures or {}),
+    )
 
 
 def arrival(game: AbstractGame) -> str:
-    """`game.success` in words: the one definition of success, or the one that a task has instead."""
+    """`game.success` in words, also where a task has a definition of its own."""
     while isinstance(game, Perturbed):
         game = game.inner
     if type(game).success is AbstractGame.success:
@@ -256,7 +342,7 @@ def arrived(radius: float) -> str:
     return f"every agent within {radius:g} m of its goal"
 
 
-def scope(game: AbstractGame, steps: int, disturbance: str = "none") -> dict[str, Any]:
+def limits(game: AbstractGame, steps: int, disturbance: str = "none") -> dict[str, Any]:
     """What a sampled claim is limited to."""
     return {
         "starts": f"the starts that {type(game).__name__}.reset draws",

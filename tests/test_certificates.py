@@ -9,12 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap.certificate import AbstractCertificate, Verdict, percent, sentence, start_of
-from marlyap.certificates import CERTIFICATES, bounds
+from marlyap.certificate import (
+    AbstractCertificate,
+    Verdict,
+    failures_allowed,
+    percent,
+    sentence,
+    start_of,
+)
+from marlyap.certificates import CERTIFICATES, bounds, quantiles
 from marlyap.certificates.basin import Basin, largest_level
 from marlyap.certificates.closed_form import ClosedForm
 from marlyap.certificates.composition import Composition, fit_row
-from marlyap.certificates.contraction import Contraction, failures_allowed
+from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
 from marlyap.certificates.linearisation import Linearisation
 from marlyap.certificates.proof import Loop, Proof, extents, lyapunov
@@ -378,6 +385,111 @@ def test_composition(A, fine):
     table = {"composition": Composition(rollouts=N, calibration=N, share=0.9)}
     result = certified(flow([[A, 0.0], [0.0, A]]), Idle(), table)
     assert result["holds"] == fine
+
+
+class Near(Flow):
+    """The same from starts within a small box (m)."""
+
+    start: float = 0.03
+
+    def reset(self, key):
+        state = super().reset(key)
+        return State(x=state.x * self.start / 2, goal=state.goal, t=state.t)
+
+
+@pytest.mark.parametrize(
+    "growth, start", [(1.2 ** (1 / 40), 0.03), (2 ** (1 / 40), 0.01), (1.00001, 0.03)]
+)
+def test_composition_of_what_grows_is_refused(growth, start):
+    """From starts inside their own bound the inequalities hold for a while, and say nothing."""
+    game = Near(growth * jnp.eye(2), jnp.asarray(0.0), start=start)
+    verdict = Composition(rollouts=N, calibration=N).check(game, Idle(), Quadratic(jnp.eye(2)), 0)
+    assert not verdict.holds and verdict.claim.startswith("nothing was contracted")
+    assert verdict.bound is None and sentence(verdict).endswith(": does not hold.")
+
+
+def test_composition_says_until_when():
+    verdict = Composition(rollouts=N, calibration=N).check(
+        flow([[0.8, 0.0], [0.0, 0.8]]), Idle(), Quadratic(jnp.eye(2)), 0
+    )
+    assert verdict.holds and "until step 90 (9 s)" in verdict.claim
+    assert verdict.figures["begin_above"] > N / 2 and np.any(verdict.figures["M"])
+
+
+class Dips(Quadratic):
+    """A quadratic form that is negative on a strip which some rollouts cross."""
+
+    P: jax.Array = eqx.field(default_factory=lambda: jnp.eye(2))
+
+    def value(self, game, state):
+        strip = jnp.abs(state.x[0, 0] - 1.0) < 0.002
+        return super().value(game, state) * jnp.where(strip, -1e-3, 1.0)
+
+
+def test_a_negative_v_is_no_lyapunov_function():
+    game = flow([[0.8, 0.0], [0.0, 0.8]])
+    table = {name: TABLE[name] for name in ("decrease", "basin", "quantiles")}
+    table["theorem1"] = Theorem1(rollouts=N, share=0.95)
+    assert holding(certified(game, Idle(), table, V=Quadratic(jnp.eye(2)))) == set(table)
+    result = certified(game, Idle(), table, V=Dips())
+    for verdict in result["verdicts"].values():
+        assert not verdict["holds"] and verdict["bound"] is None
+        assert "rollouts, so it is no Lyapunov function" in verdict["claim"]
+
+
+def test_a_verdict_on_nothing_does_not_hold():
+    """Starts inside the ball and an unstable plant: no transition and no window to judge."""
+    game = Near(1.02 * jnp.eye(2), jnp.asarray(0.0), start=0.02)
+    for certificate in (TABLE["decrease"], TABLE["contraction"]):
+        verdict = certificate.check(game, Idle(), Quadratic(jnp.eye(2)), 0)
+        assert not verdict.holds and verdict.claim.startswith("nothing to judge: 0 of 600")
+        assert verdict.trials == 0 and verdict.bound is None
+
+
+def test_trials_are_what_leaves_something_to_judge():
+    """Half of the starts lie inside the ball; of them a decrease says nothing."""
+    game = Near(0.8 * jnp.eye(2), jnp.asarray(0.0), start=0.15)
+    verdict = TABLE["decrease"].check(game, Idle(), Quadratic(jnp.eye(2)), 0)
+    outside = 1 - np.pi * 0.1**2 / 0.3**2
+    assert verdict.holds and verdict.trials == pytest.approx(outside * N, rel=0.1)
+    assert verdict.figures["drawn"] == N
+
+
+def test_growth_is_not_called_contraction():
+    game = flow([[1.05, 0.0], [0.0, 1.05]])
+    verdict = TABLE["contraction"].check(game, Idle(), Quadratic(jnp.eye(2)), 0)
+    assert not verdict.holds and verdict.figures["beta"] == pytest.approx(1 - 1.05**20, rel=1e-3)
+    assert verdict.claim.startswith("the cost does not contract") and "grows by" in verdict.claim
+    assert verdict.bound > 0.95 and sentence(verdict).endswith(": does not hold.")
+
+
+def test_an_infinite_bound_reads_unbounded():
+    verdict = TABLE["quantiles"].check(
+        flow([[1.0, 0.0], [0.0, 1.0]]), Idle(), Quadratic(jnp.eye(2)), 0
+    )
+    assert "settling time unbounded;" in verdict.claim and not verdict.holds
+    bounds = {"final_distance": 0.04121, "settling_time": 3.8, "largest_rise": np.inf}
+    said = quantiles.claim(0.95, bounds, "a form", 40, 0.1)
+    assert "final distance at most 0.04121 m; settling time at most 3.8 s" in said
+    assert "largest rise unbounded of V" in said
+    assert quantiles.at_most(0.123401) == "at most 0.1235"  # an upper bound is rounded up
+
+
+def test_perturbations_that_cannot_be_applied_are_named():
+    class Judged(Rendezvous):
+        def success(self, state):
+            return jnp.all(self.distance(state) <= self.radius)
+
+    few = Robustness(400, (0.5,), (), (), (), (), share=0.9)
+    game = Judged(agents=2, graph="path", dynamics=SingleIntegrator())
+    verdict = few.check(game, lambda s, k: s.goal - s.x, CostSum(Idle()), 0)
+    assert "without agent 1" in verdict.figures["without"]
+    assert "(left out: without agent 1, because an agent of Judged" in verdict.claim
+    assert (
+        "without agent" not in verdict.scope["disturbance"] and len(verdict.figures["curve"]) == 2
+    )
+    with pytest.raises(UserError, match="gain 0.5, because the inputs of this game"):
+        few.check(flow([[0.8, 0.0], [0.0, 0.8]]), Idle(), CostSum(Idle()), 0)
 
 
 def test_composition_fits_a_known_row():

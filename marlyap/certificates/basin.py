@@ -1,5 +1,6 @@
 """C4: the largest level set of V from which no rollout failed, confirmed on fresh starts."""
 
+import dataclasses
 from typing import ClassVar
 
 import numpy as np
@@ -8,14 +9,12 @@ from marlyap.certificate import (
     AbstractCertificate,
     Evidence,
     Judgement,
-    Verdict,
     arrival,
-    at_least,
     judged,
+    no_lyapunov,
+    of_share,
     percent,
-    scope,
     until_step,
-    worst_of,
 )
 from marlyap.certificates.reach import ReachAndStay
 from marlyap.rollout import until
@@ -60,40 +59,41 @@ class Basin(AbstractCertificate):
     def check(self, game, controller, V, seed):
         steps, n = game.horizon + max(self.stay, V.beyond), self.rollouts
         each = bonferroni(self.confidence, 2)
-        first = judged(self.judge, game, controller, V, seed, "calibrate", self.calibration, steps)
+        first, found = (
+            judged(self.judge, game, controller, V, seed, purpose, count, steps, True)
+            for purpose, count in (("calibrate", self.calibration), ("certify", n))
+        )
         level = largest_level(first.figures["V"], first.holds)
-        found = judged(self.judge, game, controller, V, seed, "certify", n, steps)
-        inside = found.figures["V"] <= level
-        m, k = int(inside.sum()), int((found.holds & inside).sum())
-        bound, shown = at_least(k, m, self.share, each)
+        found = dataclasses.replace(found, asked=found.figures["V"] <= level)
+        m = int(found.asked.sum())
         mass = clopper_pearson(m, n, each)
-        needed = trials_needed(1 - self.share, each)
-        return Verdict(
+        say = lambda bound: claim(
+            bound,
+            V.meaning,
+            level,
+            arrival(game),
+            game.horizon,
+            self.stay,
+            game.dt,
+            float(mass.low),
+        )
+        return of_share(
+            self,
+            game,
+            V,
+            seed,
+            found,
+            game.horizon + self.stay,
+            say,
             name="basin",
-            claim=claim(
-                bound,
-                V.meaning,
-                level,
-                arrival(game),
-                game.horizon,
-                self.stay,
-                game.dt,
-                float(mass.low),
-            ),
-            evidence=self.evidence,
-            holds=shown,
-            bound=bound,
-            confidence=self.confidence,
-            scope=scope(game, game.horizon + self.stay) | {"starts_with": f"V <= {level:.6g}"},
-            trials=m,
-            successes=k,
-            worst=worst_of(game, seed, "certify", found, inside) if m else None,
+            confidence=each,
+            void=no_lyapunov(V, first, found),
+            to_judge=f"begin with V <= {level:.4g}",
+            scope={"starts_with": f"V <= {level:.6g}"},
             figures={
                 "level": level,
                 "mass": [mass.low, mass.high],
-                "drawn": n,
-                "needed_inside": needed,
-                "share_asked": self.share,
+                "needed_inside": trials_needed(1 - self.share, each),
                 "stay_steps": self.stay,
                 "V": type(V).__name__,
                 "failures_calibrating": int((~first.holds).sum()),

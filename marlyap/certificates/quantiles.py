@@ -15,7 +15,8 @@ from marlyap.certificate import (
     Judgement,
     Verdict,
     judged,
-    scope,
+    limits,
+    no_lyapunov,
     until_step,
     worst_of,
 )
@@ -71,20 +72,21 @@ class Quantiles(AbstractCertificate):
                 f"{each:.6g}; at least {needed} are needed."
             )
         H, n = game.horizon, self.rollouts
-        found = judged(self.judge, game, controller, V, seed, "certify", n, H + V.beyond)
+        found = judged(self.judge, game, controller, V, seed, "certify", n, H + V.beyond, True)
         sample = {
             name: np.where(found.holds & ~np.isnan(v), v, np.inf)
             for name, v in found.figures.items()
         }
         bounds = {name: quantile_upper_bound(sample[name], self.q, each) for name in NAMES}
+        void = no_lyapunov(V, found)
         return Verdict(
             name="quantiles",
-            claim=claim(self.q, bounds, V.meaning, H, game.dt),
+            claim=void or claim(self.q, bounds, V.meaning, H, game.dt),
             evidence=self.evidence,
-            holds=bool(np.all(np.isfinite(list(bounds.values())))),
-            bound=bounds["final_distance"],
+            holds=void is None and bool(np.all(np.isfinite(list(bounds.values())))),
+            bound=None if void else bounds["final_distance"],
             confidence=self.confidence,
-            scope=scope(game, H),
+            scope=limits(game, H),
             trials=n,
             worst=worst_of(game, seed, "certify", found),
             figures={"q": self.q, "bounds": bounds, "V": type(V).__name__},

@@ -9,12 +9,11 @@ from marlyap.certificate import (
     AbstractCertificate,
     Evidence,
     Judgement,
-    Verdict,
     arrival,
     enough,
     judged,
+    of_share,
     percent,
-    share_of,
     until_step,
 )
 
@@ -47,14 +46,8 @@ class Reach(AbstractCertificate):
         enough(self.rollouts, self.share, self.confidence)
         H = game.horizon
         found = judged(self.judge, game, controller, V, seed, "certify", self.rollouts, H)
-        bound, holds, fields = share_of(self, game, seed, found, H)
-        return Verdict(
-            name="reach",
-            claim=claim(bound, arrival(game), H * game.dt),
-            **fields,
-            holds=holds,
-            figures={"share_asked": self.share},
-        )
+        say = lambda bound: claim(bound, arrival(game), H * game.dt)
+        return of_share(self, game, V, seed, found, H, say, name="reach")
 
     def judge(self, game, V, trajectory, key):
         last = jax.tree.map(lambda leaf: leaf[-1], trajectory.state)
@@ -80,14 +73,9 @@ class ReachAndStay(AbstractCertificate):
         enough(self.rollouts, self.share, self.confidence)
         steps = game.horizon + self.stay
         found = judged(self.judge, game, controller, V, seed, "certify", self.rollouts, steps)
-        bound, holds, fields = share_of(self, game, seed, found, steps)
-        return Verdict(
-            name="reach-and-stay",
-            claim=claim_stay(bound, arrival(game), game.horizon, steps, game.dt),
-            **fields,
-            holds=holds,
-            figures={"share_asked": self.share, "stay_steps": self.stay},
-        )
+        say = lambda bound: claim_stay(bound, arrival(game), game.horizon, steps, game.dt)
+        name, figures = "reach-and-stay", {"stay_steps": self.stay}
+        return of_share(self, game, V, seed, found, steps, say, name=name, figures=figures)
 
     def judge(self, game, V, trajectory, key):
         late = jax.tree.map(lambda leaf: leaf[game.horizon :], trajectory.state)
