@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import marlyap.recheck.checker
-import marlyap.recheck.world
+
 import marlyap.threefry
 from marlyap import store
 from marlyap.certificate import start_of
@@ -29,8 +29,9 @@ from marlyap.identity import named_arrays, plain
 from marlyap.lyapunov_function import Norm, Quadratic
 from marlyap.nets import Actors, Greedy, NormNet, Shape
 from marlyap.perturb import Perturbed, traced
-from marlyap.recheck.checker import lower, order, recheck
-from marlyap.recheck.world import Rejected, Replica
+from marlyap.recheck import Rejected, recheck
+from marlyap.recheck.bounds import lower, order
+from marlyap.recheck.world import World
 from marlyap.rollout import Decentralised, rollout
 from marlyap.statistics import lower_bound, quantile_upper_bound
 from marlyap.tasks.rendezvous import Rendezvous
@@ -346,7 +347,7 @@ def test_its_world_is_the_same(dynamics, kind, change):
     arrays = {f"controller/{k}": v for k, v in named_arrays(controller).items()}
     arrays |= {f"V/{k}": v for k, v in named_arrays(V).items()}
     meta = {"game": plain(nominal), "controller": plain(controller), "V": plain(V), "seed": 7}
-    sim = Replica(meta, arrays)
+    sim = World(meta, arrays)
     found = sim.roll(3, 15, change)
     assert np.allclose(found["x"][2], seen.state.x, atol=1e-4)
     if not change:

@@ -38,7 +38,9 @@ def agree(what: str, found: Any, said: Any) -> None:
     """Raise Rejected unless both are the same JSON, so that neither 1.0 nor true passes for 1."""
     if json.dumps(found, sort_keys=True) != json.dumps(said, sort_keys=True):
         short = lambda value: value if isinstance(value, str) else f"{value!r:.200}"
-        raise Rejected(f"certificate: {what} is {short(found)}, not {short(said)} as the file says.")
+        raise Rejected(
+            f"certificate: {what} is {short(found)}, not {short(said)} as the file says."
+        )
 
 
 def record(what: str, value: Any, types: dict[str, tuple[type, ...]]) -> None:
@@ -52,7 +54,9 @@ def record(what: str, value: Any, types: dict[str, tuple[type, ...]]) -> None:
             raise Rejected(f"certificate: {what} has no {key!r}.")
         if type(value[key]) not in types[key]:
             kind = " or ".join(t.__name__ for t in types[key])
-            raise Rejected(f"certificate: {key} of {what} is {value[key]!r:.80}, not of type {kind}.")
+            raise Rejected(
+                f"certificate: {key} of {what} is {value[key]!r:.80}, not of type {kind}."
+            )
 
 
 def read(directory: Path) -> tuple[Arrays, dict[str, Any]]:

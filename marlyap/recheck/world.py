@@ -6,7 +6,6 @@ shows.
 
 import json
 import math
-import re
 import zlib
 from typing import Any
 
@@ -32,6 +31,7 @@ WHOLE, NUMBER, FLAG, TEXT, LIST, OBJECT = (int,), (int, float), (bool,), (str,),
 GAME = dict(kind=TEXT, agents=WHOLE, leaders=LIST, graph=TEXT, radius=NUMBER, size=NUMBER)
 GAME |= dict(headings=FLAG, rest_weight=NUMBER, dt=NUMBER, horizon=WHOLE, dynamics=OBJECT)
 DYNAMICS = dict(kind=TEXT, limits=LIST, integrator=TEXT)
+NORM = dict(kind=TEXT, net=OBJECT, errors=WHOLE, slope=NUMBER)
 LAYER = {"kind": "Layer", "weight": None, "bias": None}
 V_KEYS = {
     "CostSum": dict(kind=TEXT, controller=OBJECT, T=WHOLE, ball=NUMBER),
@@ -45,7 +45,8 @@ class World:
 
     def __init__(self, meta: dict[str, Any], arrays: Arrays):
         self.game, self.controller, self.V = meta["game"], meta["controller"], meta["V"]
-        self.arrays, self.used, self.cache, self.seed = arrays, {"controller/words"}, {}, meta["seed"]
+        self.arrays, self.seed, self.cache = arrays, meta["seed"], {}
+        self.used = {"controller/words"}
         self.known()
         record("the game", self.game, GAME)
         model = self.game["dynamics"]
@@ -55,9 +56,10 @@ class World:
         self.linked = adjacency(self.game["graph"], self.game["agents"])
         self.slots = places(self.linked, self.game["graph"])
         self.leads = np.isin(np.arange(len(self.slots)), self.game["leaders"])
-        self.layers = self.network("controller/policy.pi.net", self.controller["policy"]["pi"]["net"])
-        pi = {"kind": "Actors", "net": self.controller["policy"]["pi"]["net"]}
-        pi |= {"shared": self.controller["policy"]["pi"]["shared"] is True, "du": len(self.limits)}
+        pi = self.controller["policy"]["pi"]
+        self.layers, self.shared = self.network("controller/policy.pi.net", pi["net"]), pi["shared"]
+        pi = {"kind": "Actors", "net": pi["net"], "shared": self.shared is True}
+        pi |= {"du": len(self.limits)}
         whole = {"kind": "Decentralised", "policy": {"kind": "Greedy", "pi": pi}, "game": self.game}
         agree("what the controller is made of", whole, self.controller)
         text = json.dumps(self.controller, sort_keys=True).encode()
@@ -96,15 +98,23 @@ class World:
             self.used |= {"V/P"}
         elif kind == "Norm":
             self.net = self.network("V/net.net", self.V["net"]["net"])
-            about = {"kind": "NormNet", "net": self.V["net"]["net"], "slope": self.V["net"]["slope"]}
-            about |= {"errors": 2 + self.motion(np.zeros((1, KNOWN[self.kind][0])))[1].shape[-1]}
-            agree("what V is made of", about, self.V["net"])
+            rates = self.motion(np.zeros((1, KNOWN[self.kind][0])))[1].shape[-1]
+            about = {"kind": "NormNet", "errors": 2 + rates}
+            agree("what V is made of", self.V["net"] | about, self.V["net"])
+            record("the network in V", self.V["net"], NORM)
         else:
             self.used |= {name for name in self.arrays if name.startswith("V/")}
         for copy, name in alike.items():
             if self.arrays[copy].tobytes() != self.arrays[name].tobytes():
                 raise Rejected("certificate: V is of another policy than the one it certifies.")
         self.used |= {*alike}
+
+    def asked(self) -> None:
+        """Raise UserError if V, which a certificate is about, is not known."""
+        if self.V["kind"] not in V_KEYS:
+            raise UserError(
+                f"recheck: V of kind {self.V['kind']} is unknown to it; certify by another V."
+            )
 
     def network(self, prefix: str, said: dict[str, Any]) -> list[dict[str, np.ndarray]]:
         """The layers in float64, of a network that is described as the file has it."""
@@ -126,7 +136,7 @@ class World:
         return fold(fold(seed, zlib.crc32(purpose.encode())), np.atleast_1d(episodes))
 
     def starts(self, key: Any) -> tuple[np.ndarray, np.ndarray, Any]:
-        """States [episode, agent, .], goals, and streams of disturbances, from streams of starts."""
+        """States [episode, agent, .], goals, and streams of disturbances, from those of starts."""
         size = self.game["size"]
         draw = lambda i, *shape: 2.0 * uniform(fold(key, i), *shape) - 1
         x = np.zeros((len(key[0]), len(self.slots), KNOWN[self.kind][0]))
@@ -222,10 +232,39 @@ class World:
         return np.stack(rows, axis=1)
 
     def act(self, x: np.ndarray, goal: np.ndarray, linked: np.ndarray) -> np.ndarray:
-        obs, shared = self.observe(x, goal, linked), self.controller["policy"]["pi"]["shared"]
-        pick = lambda i: [{k: w if shared else w[i] for k, w in l.items()} for l in self.layers]
+        obs = self.observe(x, goal, linked)
+        pick = lambda i: [
+            {k: w if self.shared else w[i] for k, w in l.items()} for l in self.layers
+        ]
         out = np.stack([forward(pick(i), obs[:, i]) for i in range(x.shape[1])], axis=1)
         return np.tanh(out[..., : out.shape[-1] // 2])
+
+    def cost(self, seen: dict[str, np.ndarray]) -> np.ndarray:
+        """The team's cost [rollout, state], with the weight on its motion."""
+        still = (self.motion(seen["x"])[1] ** 2).sum(axis=-1)
+        return (seen["distance"] + self.game["rest_weight"] * still).mean(axis=2)
+
+    @property
+    def beyond(self) -> int:
+        """How many states V looks ahead."""
+        return self.V["T"] if self.V["kind"] == "CostSum" else 0
+
+    def value(self, x: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """V of states [episode, agent, .], each with its own goals."""
+        none = np.zeros(1, np.uint32), np.zeros(1, np.uint32)
+        return self.values(self.drive(x.copy(), goal, none, self.beyond, {}), 1)[:, 0]
+
+    def gradient(self, x: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """dV/dx of one state [agent, .], by central differences."""
+        move = 1e-5 * np.eye(x.size).reshape(x.size, *x.shape)
+        goals = np.broadcast_to(goal, (x.size, *goal.shape))
+        return (self.value(x + move, goals) - self.value(x - move, goals)) / 2e-5
+
+    def lipschitz(self) -> float:
+        """A bound on how fast V, a network, changes with the errors."""
+        stretch = lambda l: np.abs(l["gain"]).max() / math.sqrt(1e-5) if "gain" in l else 1.0
+        bounds = [np.linalg.norm(l["W"], 2) * stretch(l) for l in self.net]
+        return float(np.prod(bounds)) + self.V["net"]["slope"]
 
     def values(self, seen: dict[str, np.ndarray], time: int) -> np.ndarray:
         """V of the first `time` states of every rollout."""
@@ -237,8 +276,6 @@ class World:
         e = np.concatenate([frame(h, seen["goal"][:, None] - x[..., :2]), self.motion(x)[1]], -1)
         if kind == "Quadratic":
             return np.einsum("...i,ij,...j", e, self.arrays["V/P"].astype(float), e).sum(-1)
-        if kind != "Norm":
-            raise UserError(f"recheck: V of kind {kind} is unknown to it; certify by another V.")
         e = e.reshape(*e.shape[:2], -1)
         change = forward(self.net, e) - forward(self.net, np.zeros(e.shape[-1]))
         return np.linalg.norm(change, axis=-1) + self.V["net"]["slope"] * np.linalg.norm(e, axis=-1)
@@ -269,6 +306,15 @@ def places(linked: np.ndarray, graph: str) -> np.ndarray:
     rows = [np.flatnonzero(row) for row in linked]
     room = int(graph.partition("/")[2] or max(map(len, rows)))
     return np.array([np.append(row, np.full(room, -1))[:room] for row in rows]).reshape(-1, room)
+
+
+def hops(linked: np.ndarray, sources: np.ndarray) -> np.ndarray:
+    """Edges from the nearest source to each agent; -1 where there is no path."""
+    distance, reached, step = np.where(sources, 0, -1), sources, 0
+    while (fresh := linked[reached].any(axis=0) & (distance < 0)).any():
+        step += 1
+        distance[fresh], reached = step, fresh
+    return distance
 
 
 def frame(h: np.ndarray, v: np.ndarray) -> np.ndarray:
