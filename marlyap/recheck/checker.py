@@ -97,6 +97,8 @@ def derive(
         if name not in asked or name not in verdicts:
             what = "has no verdict" if name in asked else "was not asked for"
             raise Rejected(f"certificate: {name} {what}.")
+    if not verdicts:
+        raise Rejected("certificate: it has no verdict, so there is nothing to check.")
     sim = World(meta, arrays)
     shared = max(1, sum(kind in STATISTICAL for kind in kinds.values()))
     tail = (1 - meta["confidence"]) / (shared * meta["checkpoints"])

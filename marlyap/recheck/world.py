@@ -305,7 +305,7 @@ def places(linked: np.ndarray, graph: str) -> np.ndarray:
     """Whom each agent observes [agent, slot], in ascending order; -1 in a slot that is empty."""
     rows = [np.flatnonzero(row) for row in linked]
     room = int(graph.partition("/")[2] or max(map(len, rows)))
-    return np.array([np.append(row, np.full(room, -1))[:room] for row in rows]).reshape(-1, room)
+    return np.array([np.append(row, np.full(room, -1))[:room] for row in rows]).reshape(len(rows), room)
 
 
 def hops(linked: np.ndarray, sources: np.ndarray) -> np.ndarray:
