@@ -21,9 +21,11 @@ from marlyap.certificates.basin import Basin
 from marlyap.certificates.composition import Composition
 from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
+from marlyap.certificates.linearisation import Linearisation
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness, moved
+from marlyap.certificates.safety import Apart
 from marlyap.certificates.theorem1 import Theorem1
 from marlyap.certify import certify, save
 from marlyap.cli import main
@@ -56,6 +58,8 @@ TABLE = {
     ),
     "composition": Composition(rollouts=N, calibration=100, share=0.9, stay=0),
     "theorem1": Theorem1(rollouts=N, share=0.9, noise=0.02),
+    "apart": Apart(rollouts=N, calibration=N, share=0.9, stay=10, least=0.0),
+    "linearisation": Linearisation(scenes=3),
 }
 GAME = Rendezvous(agents=2, leaders=(0, 1), horizon=24, dynamics=SingleIntegrator((2.0, 2.0)))
 FAR = 8.0  # more than any goal is away (m)
@@ -180,7 +184,7 @@ def set_holds(meta, arrays):
 
 def set_confidences(meta, arrays):
     """Everywhere, without the bounds."""
-    each = 1 - (1 - 0.9999) / 9
+    each = 1 - (1 - 0.9999) / 10
     meta["confidence"], meta["confidence_each"] = 0.9999, each
     for name in meta["verdicts"]:
         meta["verdicts"][name]["confidence"] = meta["certificates"][name]["confidence"] = each

@@ -11,8 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from marlyap.recheck import checks
 from marlyap.recheck.checks import Case, near
+from marlyap.recheck.linear import linearisation
 from marlyap.recheck.reader import Arrays, Rejected, agree, policy_hash, read, record
 from marlyap.recheck.sentences import Sentences
 from marlyap.recheck.world import FLAG, LIST, NUMBER, OBJECT, TEXT, WHOLE, World
@@ -22,7 +25,7 @@ MALFORMED = (ArithmeticError, AttributeError, LookupError, MemoryError, TypeErro
 NONE = type(None)
 FILE = dict(schema=WHOLE, holds=FLAG, confidence=(float,), confidence_each=(float,))
 FILE |= dict(checkpoints=WHOLE, seed=WHOLE, policy=TEXT, game=OBJECT, controller=OBJECT, V=OBJECT)
-FILE |= dict(certificates=OBJECT, verdicts=OBJECT)
+FILE |= dict(certificates=OBJECT, verdicts=OBJECT, information=TEXT, left_out=OBJECT)
 VERDICT = dict(name=TEXT, claim=TEXT, evidence=TEXT, holds=FLAG, bound=(float, NONE))
 VERDICT |= dict(confidence=(float, NONE), scope=OBJECT, trials=(int, NONE), successes=(int, NONE))
 VERDICT |= dict(worst=(dict, NONE), figures=OBJECT)
@@ -42,6 +45,8 @@ ASKED = {
     | dict(calibration=WHOLE, T=WHOLE, stay=WHOLE, weights=LIST, slack=NUMBER)
     | dict(within=(*NUMBER, NONE)),
     "Theorem1": SAMPLED | dict(old=(dict, NONE), noise=NUMBER, rate=NUMBER, lipschitz=TEXT),
+    "Apart": SAMPLED | dict(calibration=WHOLE, stay=WHOLE, least=NUMBER),
+    "Linearisation": dict(scenes=WHOLE, margin=NUMBER, decay=NUMBER),
     "Proof": dict(c=NUMBER, rho=NUMBER, inner=NUMBER, half=LIST, eta=NUMBER, decay=NUMBER)
     | dict(most=WHOLE, batch=WHOLE, resume=(str, NONE), show=FLAG),
 }
@@ -52,11 +57,13 @@ CHECKS: dict[str, Callable[[Case], dict[str, Any]]] = {
     "Contraction": checks.contraction,
     "Basin": checks.basin,
     "Quantiles": checks.quantiles,
+    "Apart": checks.apart,
     "Robustness": checks.robustness,
     "Composition": checks.composition,
     "Theorem1": checks.theorem1,
 }
-STATISTICAL = CHECKS.keys()  # those that share the confidence
+STATISTICAL = {*CHECKS}  # those that share the confidence
+CHECKS["Linearisation"] = linearisation
 ASKS_V = ("Decrease", "Basin", "Quantiles", "Theorem1")
 
 
@@ -104,6 +111,14 @@ def derive(
     tail = (1 - meta["confidence"]) / (shared * meta["checkpoints"])
     near("the confidence of each certificate", 1 - tail, meta["confidence_each"], 1e-12)
     say, done, left = Sentences(meta["game"], meta["V"]), {}, {}
+    agree("what the agents act on", say.information, meta["information"])
+    if any(kind in ASKS_V for kind in kinds.values()):
+        sim.asked()
+        worst, usual = at_target(sim)
+        if not worst <= 2 * ZERO * max(usual, 1e-12):
+            raise Rejected(f"certificate: V is {worst:.3g} on the target set, where it must be 0.")
+    for name, why in meta["left_out"].items():
+        left |= left_out(sim, say, name, why, asked)
     for name, v in verdicts.items():
         c, kind = asked[name], kinds[name]
         record(f"the verdict of {name}", v, VERDICT)
@@ -113,8 +128,6 @@ def derive(
             near(f"the confidence of {name}", 1 - tail, v["confidence"], 1e-12)
         else:
             agree(f"the confidence of {name}", None, v["confidence"])
-        if kind in ASKS_V:
-            sim.asked()
         if kind not in CHECKS:
             left[name] = unchecked(sim, kind)
             continue
@@ -124,7 +137,9 @@ def derive(
             continue
         done[name] = found
         tell(name, v)
-    agree("whether all hold", all(v["holds"] for v in verdicts.values()), meta["holds"])
+    whole = all(v["holds"] for v in verdicts.values())
+    if not (whole and meta["left_out"]):  # what is left out may have been optional, or not
+        agree("whether all hold", whole, meta["holds"])
     holds = None if left else meta["holds"]
     return {"agrees": not left, "holds": holds, "rechecked": done, "not_rechecked": left}
 
@@ -136,11 +151,53 @@ def kind_of(name: str, asked: Any) -> str:
     kind = asked.get("kind") if isinstance(asked, dict) else None
     if kind not in ASKED:
         raise Rejected(f"certificate: {name} is of kind {kind}, which recheck does not know.")
-    usual = re.sub("(?!^)(?=[A-Z])", "-", kind).lower()
-    if name != usual:
-        raise Rejected(f"certificate: a {kind} is called {usual}, not {name}.")
+    if name != usual(kind):
+        raise Rejected(f"certificate: a {kind} is called {usual(kind)}, not {name}.")
     record(f"what is asked of {name}", asked, ASKED[kind] | dict(kind=TEXT, confidence=(float,)))
     return kind
+
+
+ZERO = 1e-5  # of V's usual size: V on the target set
+
+
+def at_target(sim: World) -> tuple[float, float]:
+    """The largest |V| at 64 targets, and its median at as many starts."""
+    key = sim.keys(np.arange(64), "calibrate")
+    usual = np.median(np.abs(sim.value(*sim.starts(key)[:2])))
+    return float(np.abs(sim.value(*sim.targets(key))).max()), float(usual)
+
+
+def left_out(
+    sim: World, say: Sentences, name: str, why: Any, asked: dict[str, Any]
+) -> dict[str, str]:
+    """Check why a certificate was left out; returns it with a reason where that cannot be done."""
+    kind = {usual(kind): kind for kind in (*ASKED, "Safe", "ClosedForm")}.get(name)
+    if kind is None or name in asked:
+        raise Rejected(f"certificate: {name!r} cannot have been left out.")
+    V = re.compile(re.escape(say.not_zero("@", "@")).replace("@", "([0-9.e+-]{1,12})"))
+    if kind in ASKS_V and (told := V.fullmatch(str(why))):
+        sim.asked()
+        for part, own, number in zip(
+            ("worst", "usual"), at_target(sim), told.groups(), strict=True
+        ):
+            near(f"the {part} V of what was left out", own, float(number), 2e-2 * abs(own))
+        if not at_target(sim)[0] > 0.5 * ZERO * at_target(sim)[1]:
+            raise Rejected(f"certificate: {name} was left out, but V is 0 on the target set.")
+        return {}
+    T = re.fullmatch(r"contraction: (\d{1,9}) steps .*", str(why))
+    fits = {"Safe": say.no_rule()}
+    fits |= {"Apart": say.alone()} if sim.game["agents"] == 1 else {}
+    fits |= {"Contraction": say.too_long(int(T[1]))} if T and int(T[1]) > say.H else {}
+    if fits.get(kind) == why:
+        return {}
+    if kind in ("ClosedForm", "Proof"):
+        return {name: "it was left out, and whether it had to be is not known here"}
+    raise Rejected(f"certificate: the reason for leaving out {name} is not true.")
+
+
+def usual(kind: str) -> str:
+    """The name of the certificate of a kind: reach-and-stay for ReachAndStay."""
+    return re.sub("(?!^)(?=[A-Z])", "-", kind).lower()
 
 
 def unchecked(sim: World, kind: str) -> str:

@@ -111,12 +111,11 @@ def of_share(
     if not 0 <= successes <= trials:
         raise Rejected(f"certificate: {name} has more successes than trials.")
     least, share = needed(c["share"], tail), c["share"]
-    if not voids and trials < least:
-        voids = [case.say.nothing_to_judge(trials, c["rollouts"], to_judge, least, share)]
     bound = math.inf if voids else lower(successes, trials, tail)
     near(f"the bound of {name}", bound, v["bound"], 1e-9)
     agree(f"whether {name} holds", bool(not voids and bound >= share and also), v["holds"])
-    claims = voids or [claim(v["bound"])]
+    few = case.say.nothing_to_judge(trials, c["rollouts"], to_judge, least, share)
+    claims = voids or ([few] if trials < least else [claim(v["bound"])])
     if v["claim"] not in claims:
         agree(f"the claim of {name}", claims[0], v["claim"])
     agree(f"the evidence of {name}", evidence, v["evidence"])
@@ -299,7 +298,7 @@ def basin(case: Case) -> dict[str, Any]:
         lambda bound: case.say.basin(bound, level, c["stay"], low),
         tail=tail,
         voids=negative(case, *values.values()),
-        to_judge=f"begin with V <= {level:.4g}",
+        to_judge=f"begin with V <= {level:.4g}, below the least V of a failure",
         scope={"starts_with": f"V <= {level:.6g}"},
         figures=own,
     )
@@ -338,6 +337,21 @@ def quantiles(case: Case) -> dict[str, Any]:
     limit = np.where(seen["sound"], distance[:, -1], np.inf)
     worst(case, judged(seen["sound"], limit, np.inf, figures=sample), v["worst"])
     return {"bounds": said}
+
+
+def apart(case: Case) -> dict[str, Any]:
+    sim, c, said = case.sim, case.c, case.figures
+    steps, d = sim.game["horizon"] + c["stay"], said["gap"]
+    if len(sim.slots) < 2:
+        raise Rejected("certificate: apart is about several agents, and the game has one.")
+    seen, gap = sim.roll(c["rollouts"], steps), np.inf
+    for i in range(1, len(sim.slots)):
+        way = seen["x"][..., i:, :2] - seen["x"][..., : len(sim.slots) - i, :2]
+        gap = np.minimum(gap, np.linalg.norm(way, axis=-1).min(axis=(1, 2)))
+    found = judged(seen["sound"], -gap, -d, scale=1e-2, figures={"gap": gap})
+    claim = lambda bound: case.say.apart(bound, d, c["least"], steps)
+    own = {"gap": d, "stay_steps": c["stay"], "calibration": c["calibration"]}
+    return of_share(case, found, steps, claim, also=d >= c["least"], figures=own)
 
 
 def robustness(case: Case) -> dict[str, Any]:

@@ -29,6 +29,9 @@ def at_most(bound: float | None, unit: str) -> str:
 class Sentences:
     """Claims and scopes about one game and one V, as recorded."""
 
+    # By construction: row i of a policy's action is made of row i of the observations alone.
+    information = "each agent acts on its own observation"
+
     def __init__(self, game: dict[str, Any], V: dict[str, Any]):
         self.game, self.H, self.dt = game, game["horizon"], game["dt"]
         self.V = MEANING.get(V["kind"], "").format(T=V.get("T"), ball=V["ball"])
@@ -46,7 +49,60 @@ class Sentences:
             "horizon_seconds": steps * self.dt,
             "disturbance": disturbance,
             "radius": self.game["radius"],
+            "information": self.information,
         }
+
+    def apart(self, bound: float, gap: float, least: float, steps: int) -> str:
+        little = f", which is less than the {least:g} m asked" if gap < least else ""
+        begin = f"on at least {percent(bound)} of starts no two agents come closer than {gap:g} m"
+        return f"{begin}{little}, at any step {self.until(steps)}"
+
+    def linearised(self, radius: float, margin: float, scenes: int) -> str:
+        begin = f"the closed loop of the game's own step, linearised at {scenes} targets, has"
+        if radius <= 1 - margin:
+            says = (
+                f"at most 1 - {margin:g}, so that rest on the goal is exponentially stable nearby"
+            )
+        else:
+            says = f"more than 1 - {margin:g}: no stability is shown"
+        return f"{begin} spectral radius {radius:.6f}, {says}"
+
+    def uncontrollable(self, count: int, decay: float) -> str:
+        return (
+            f"NO: the linearised step at the goal has {count} uncontrollable eigenvalue(s) of size "
+            "1 or more that the errors see (for a unicycle, sideways), so that no Lipschitz state "
+            f"feedback that rests there makes the errors decay by more than {decay:g} of "
+            "themselves a step; certify a ball, or a point ahead of the agents"
+        )
+
+    def no_equilibrium(self, action: float, moved: float) -> str:
+        return (
+            f"the goal is no equilibrium: on it the controller acts by {action:.3g} of the limits "
+            f"and the agents move by {moved:.3g} in a step"
+        )
+
+    def no_derivative(self) -> str:
+        return "the closed loop has no derivative at the goal"
+
+    def not_zero(self, worst: str, usual: str) -> str:
+        return (
+            f"V, {self.V}, is {worst} on the target set, where it must be 0 (it is {usual} at a "
+            "usual start); take a V that is 0 there, or certificates that do not ask for one, such "
+            "as reach."
+        )
+
+    def no_rule(self) -> str:
+        return (
+            "safe: Rendezvous has no rule to break, since it does not replace `violations`; "
+            "replace it, as by `crowded`."
+        )
+
+    def alone(self) -> str:
+        return "apart: a team of one has no two agents; set agents to 2 or more."
+
+    def too_long(self, T: int) -> str:
+        fits = f"{T} steps do not fit into an episode of {self.H}"
+        return f"contraction: {fits}; take a smaller T."
 
     def nothing_to_judge(
         self, trials: int, drawn: int, what: str, needed: int, share: float

@@ -130,21 +130,35 @@ class World:
             layers.append({k: self.arrays[name].astype(float) for k, name in names.items()})
         return layers
 
+    @property
+    def root(self) -> tuple[np.ndarray, np.ndarray]:
+        """The stream of the seed itself."""
+        return np.zeros(1, np.uint32), np.array([self.seed], np.uint32)
+
     def keys(self, episodes: Any, purpose: str = "certify") -> tuple[np.ndarray, np.ndarray]:
         """One stream per episode of those for a purpose."""
-        seed = np.zeros(1, np.uint32), np.array([self.seed], np.uint32)
-        return fold(fold(seed, zlib.crc32(purpose.encode())), np.atleast_1d(episodes))
+        return fold(fold(self.root, zlib.crc32(purpose.encode())), np.atleast_1d(episodes))
 
-    def starts(self, key: Any) -> tuple[np.ndarray, np.ndarray, Any]:
+    def starts(self, key: Any, draws: Any = uniform) -> tuple[np.ndarray, np.ndarray, Any]:
         """States [episode, agent, .], goals, and streams of disturbances, from those of starts."""
         size = self.game["size"]
-        draw = lambda i, *shape: 2.0 * uniform(fold(key, i), *shape) - 1
+        draw = lambda i, *shape: 2.0 * draws(fold(key, i), *shape) - 1
         x = np.zeros((len(key[0]), len(self.slots), KNOWN[self.kind][0]))
         x[..., :2] = size * draw(0, len(self.slots), 2)
         if self.turns:
             x[..., 2] = np.pi * draw(1, len(self.slots))
         goal = np.repeat(size * draw(2, 2)[:, None], len(self.slots), axis=1)
         return x, goal, fold(key, zlib.crc32(b"perturb"))
+
+    def targets(self, key: Any, draws: Any = uniform) -> tuple[np.ndarray, np.ndarray]:
+        """As `starts`, with every agent at rest on its goal, and headings as they were."""
+        x, goal, _ = self.starts(key, draws)
+        x[..., :2] = goal
+        return x, goal
+
+    def errors(self, x: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Way to the goal in the agent's frame, and its rates [..., agent, .]: 0 on the target."""
+        return np.concatenate([frame(self.heading(x), goal - x[..., :2]), self.motion(x)[1]], -1)
 
     def roll(
         self, n: int, steps: int, change: dict[str, Any] | None = None, purpose: str = "certify"
@@ -272,8 +286,7 @@ class World:
         if kind == "CostSum":
             cost = np.maximum(seen["distance"] - rho, 0).mean(axis=2)
             return sum(cost[:, k : k + time] for k in range(self.V["T"]))  # pyright: ignore
-        x, h = seen["x"][:, :time], self.heading(seen["x"][:, :time])
-        e = np.concatenate([frame(h, seen["goal"][:, None] - x[..., :2]), self.motion(x)[1]], -1)
+        e = self.errors(seen["x"][:, :time], seen["goal"][:, None])
         if kind == "Quadratic":
             return np.einsum("...i,ij,...j", e, self.arrays["V/P"].astype(float), e).sum(-1)
         e = e.reshape(*e.shape[:2], -1)
@@ -305,7 +318,9 @@ def places(linked: np.ndarray, graph: str) -> np.ndarray:
     """Whom each agent observes [agent, slot], in ascending order; -1 in a slot that is empty."""
     rows = [np.flatnonzero(row) for row in linked]
     room = int(graph.partition("/")[2] or max(map(len, rows)))
-    return np.array([np.append(row, np.full(room, -1))[:room] for row in rows]).reshape(len(rows), room)
+    return np.array([np.append(row, np.full(room, -1))[:room] for row in rows]).reshape(
+        len(rows), room
+    )
 
 
 def hops(linked: np.ndarray, sources: np.ndarray) -> np.ndarray:
