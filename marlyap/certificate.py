@@ -296,9 +296,9 @@ def of_share(
 ) -> Verdict:
     """The verdict that a share of the trials holds: bound, exact, at the share asked for.
 
-    The trials are the rollouts that leave something to judge. Where they are too few for the share,
-    where V is negative, or where `void` gives another reason, that is the claim instead of
-    `claim(bound)`, nothing is bounded, and the verdict does not hold. It also needs `also`.
+    The trials are the rollouts that leave something to judge. Where they are too few for the share
+    that is the claim instead of `claim(bound)`. So is a negative V, or the reason that `void` has:
+    then nothing is bounded, and the bound is None. `also` has to be true for it to hold.
 
     Arguments: certificate, with fields share and confidence; confidence, of this bound, where it is
     not the certificate's; to_judge, what a trial does, in words; scope and figures, to be added.
@@ -307,15 +307,15 @@ def of_share(
     n, k = int(found.asked.sum()), int((found.holds & found.asked).sum())
     bound, shown = at_least(k, n, certificate.share, each)
     void = void or no_lyapunov(V, found)
-    needed = trials_needed(1.0 - certificate.share, each)
+    needed, said = trials_needed(1.0 - certificate.share, each), void or claim(bound)
     if void is None and n < needed:
-        void = (
+        said = (
             f"nothing to judge: {n} of {len(found.holds)} rollouts {to_judge}, and at least "
             f"{needed} are needed to show {100 * certificate.share:g} %"
         )
     return Verdict(
         name=name,
-        claim=claim(bound) if void is None else void,
+        claim=said,
         evidence=evidence,
         holds=void is None and shown and also,
         bound=bound if void is None else None,

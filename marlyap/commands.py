@@ -291,7 +291,7 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
         tell=lambda verdict: tell(f"[{verdict.evidence}] {sentence(verdict)}"),
     )
     for name, why in result["left_out"].items():
-        tell(f"[left out] {name}: {why}")
+        tell(f"[left out] {name}: {why.removeprefix(f'{name}: ')}")
     tell(f"Information: {result['information']}.")
     save(out, result, game, controller, V, replace=args.force)
     say(f"Certificate: {out}")

@@ -255,7 +255,10 @@ def test_bad_input_is_one_sentence():
     with pytest.raises(UserError, match=r"at least \d+ are needed"):
         certified(POINT, Scripted(), few)
     with pytest.raises(UserError, match="on the target set"):
-        certified(POINT, Scripted(spin=jnp.asarray(1.0)), V=Shifted())
+        spoken = {"decrease": TABLE["decrease"]}
+        certified(POINT, Scripted(spin=jnp.asarray(1.0)), spoken, V=Shifted())
+    with pytest.raises(UserError, match="one row for each agent"):
+        certified(POINT, lambda state, key: jnp.zeros(3))
     with pytest.raises(UserError, match="fixed beforehand"):
         certified(POINT, Scripted(), few, policy="0" * 64)
     with pytest.raises(UserError, match="at least one"):
@@ -457,7 +460,7 @@ def test_a_verdict_on_nothing_does_not_hold():
     for certificate in (TABLE["decrease"], TABLE["contraction"]):
         verdict = certificate.check(game, Idle(), Quadratic(jnp.eye(2)), 0)
         assert not verdict.holds and verdict.claim.startswith("nothing to judge: 0 of 600")
-        assert verdict.trials == 0 and verdict.bound is None
+        assert verdict.trials == verdict.bound == 0
 
 
 def test_trials_are_what_leaves_something_to_judge():

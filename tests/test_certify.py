@@ -130,3 +130,16 @@ def test_bad_input_is_one_sentence_and_changes_nothing(run, certified, capsys, w
     )
     assert code == 2 and out == "" and part in line, line
     assert {p.name: p.read_bytes() for p in place.iterdir()} == before
+
+
+def test_nothing_is_silently_absent(run, tmp_path, capsys):
+    """A window of 20 steps does not fit into 12: the default set says so and goes on without."""
+    place = tmp_path / "default"
+    code, out, _ = said(
+        capsys, "certify", run.directory, "--rollouts", 400, "--confidence", 0.9, "--out", place
+    )
+    lines = out.strip().splitlines()
+    assert code == 0 and lines[0].startswith("[statistical] reach: at least 0.00 % of starts end")
+    assert lines[0].endswith("Asked 98 %, shown 0.00 % (confidence 98.00 %): not reached.")
+    assert "[left out] contraction: 20 steps do not fit into an episode of 12" in out
+    assert lines[-1] == "Information: each agent acts on its own observation."

@@ -59,10 +59,10 @@ class Basin(AbstractCertificate):
     def check(self, game, controller, V, seed):
         steps, n = game.horizon + max(self.stay, V.beyond), self.rollouts
         each = bonferroni(self.confidence, 2)
-        first, found = (
-            judged(self.judge, game, controller, V, seed, purpose, count, steps, True)
-            for purpose, count in (("calibrate", self.calibration), ("certify", n))
+        draw = lambda purpose, count: judged(
+            self.judge, game, controller, V, seed, purpose, count, steps, True
         )
+        first, found = draw("calibrate", self.calibration), draw("certify", n)
         level = largest_level(first.figures["V"], first.holds)
         found = dataclasses.replace(found, asked=found.figures["V"] <= level)
         m = int(found.asked.sum())
@@ -88,7 +88,7 @@ class Basin(AbstractCertificate):
             name="basin",
             confidence=each,
             void=no_lyapunov(V, first, found),
-            to_judge=f"begin with V <= {level:.4g}",
+            to_judge=f"begin with V <= {level:.4g}, below the least V of a failure",
             scope={"starts_with": f"V <= {level:.6g}"},
             figures={
                 "level": level,

@@ -44,7 +44,7 @@ class ClosedForm(AbstractCertificate):
     confidence: float = 1.0
     evidence: ClassVar[Evidence] = "proved"
 
-    def refuse(self, game, controller, V):
+    def refuse(self, game, controller: Any, V):
         if type(controller) is not PointOffset:
             raise UserError(
                 f"closed-form: {type(controller).__name__} is not the controller PointOffset, the "
@@ -57,7 +57,7 @@ class ClosedForm(AbstractCertificate):
         model = lambda states: successor(game, controller, np.asarray(states.x))
         require_step("closed-form", game, controller, states, model, lambda game, s: s.x)
 
-    def check(self, game, controller, V, seed):
+    def check(self, game, controller: Any, V, seed):
         self.refuse(game, controller, V)
         K, root = stiffness(game, controller)
         modes = [mode(mu, controller) for mu in np.linalg.eigvalsh(K)]

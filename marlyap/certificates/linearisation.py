@@ -96,8 +96,8 @@ class Linearisation(AbstractCertificate):
         holds, evidence = False, "observed"
         if no:
             said, evidence = claim_not(count, self.decay), self.evidence if clear else "observed"
-        elif plant or fault:
-            said = plant or fault
+        elif why := plant or fault:
+            said = why
         else:
             said, holds = claim(radius, self.margin, self.scenes), radius <= 1 - self.margin
         return Verdict(

@@ -202,14 +202,14 @@ class Loop:
     """f(x) = one step under the controller, for boxes of reduced states."""
 
     def __init__(self, game: Any, controller: Any):
-        trained = type(controller) is Decentralised and type(controller.policy) is Greedy
-        if game.agents != 1 or not trained or type(controller.policy.pi) is not Actors:
+        policy: Any = controller.policy if type(controller) is Decentralised else None
+        pi = policy.pi if type(policy) is Greedy else None
+        if game.agents != 1 or type(pi) is not Actors:
             raise UserError(
                 "proof: only a trained policy of one agent, unicycle or double integrator with "
                 "Euler steps, can be proved; set agents=1."
             )
         model.require_model("proof", game, controller, (Unicycle, DoubleIntegrator))
-        pi = controller.policy.pi
         self.dt, self.scale = game.dt, game.radius
         self.limits, self.turns = game.dynamics.limits, type(game.dynamics) is Unicycle
         self.layers = weights(pi.net, None if pi.shared else 0)

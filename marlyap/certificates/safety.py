@@ -105,12 +105,12 @@ class Apart(AbstractCertificate):
         self.refuse(game, controller, V)
         enough(self.rollouts, self.share, self.confidence)
         steps = game.horizon + self.stay
-        first, found = (
-            judged(self.judge, game, controller, V, seed, purpose, count, steps)
-            for purpose, count in (("calibrate", self.calibration), ("certify", self.rollouts))
+        draw = lambda purpose, count: judged(
+            self.judge, game, controller, V, seed, purpose, count, steps
         )
+        first, found = draw("calibrate", self.calibration), draw("certify", self.rollouts)
         gaps = np.where(first.holds, first.figures["gap"], 0.0)
-        # Four digits, rounded down, so that the claim says what is tested.
+        # To 0.1 mm, rounded down: the claim says what is tested.
         d = passing(gaps, self.rollouts, self.share, self.confidence)
         d = float(np.floor(d * 1e4) / 1e4)
         found = dataclasses.replace(found, holds=found.holds & (found.figures["gap"] >= d))

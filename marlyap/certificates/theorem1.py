@@ -66,10 +66,10 @@ class Theorem1(AbstractCertificate):
         enough(self.rollouts, self.share, self.confidence)
         n, H = self.rollouts, game.horizon
         judge = _Tuple(controller, self.old, self.noise)
-        before, found = (
-            judged(judge, game, controller, V, seed, purpose, n, H + V.beyond, True)
-            for purpose in ("calibrate", "certify")
+        draw = lambda purpose: judged(
+            judge, game, controller, V, seed, purpose, n, H + V.beyond, True
         )
+        before, found = draw("calibrate"), draw("certify")
         fig = found.figures
         constants = self.constants(game, V, before.figures)
         l = constants[self.lipschitz] if self.lipschitz in constants else constants["empirical"]
