@@ -56,7 +56,7 @@ class Found(NamedTuple):
     edge: np.ndarray  # `asked` may as well be the other
 
 
-def near(what: str, found: float, said: Any, room: float) -> None:
+def near(what: str, found: float | int, said: Any, room: float | int) -> None:
     """Raise Rejected unless the file's number is of the same type, and this near; null: infinite"""
     if type(found) is not type(said) or not abs(found - said) <= room:
         agree(what, found if math.isfinite(found) else None, said)
