@@ -25,7 +25,7 @@ from marlyap.certificates.linearisation import Linearisation
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness, moved
-from marlyap.certificates.safety import Apart
+from marlyap.certificates.safety import Apart, Safe
 from marlyap.certificates.theorem1 import Theorem1
 from marlyap.certify import certify, save
 from marlyap.cli import main
@@ -42,7 +42,7 @@ from marlyap.recheck.world import World, adjacency, hops, places
 from marlyap.rollout import Decentralised, rollout
 from marlyap.statistics import lower_bound, quantile_upper_bound, trials_needed
 from marlyap.tasks.rendezvous import Rendezvous
-from marlyap.threefry import fold, normal, uniform
+from marlyap.threefry import fold, normal, uniform, uniform64
 
 
 N = 300
@@ -149,8 +149,9 @@ def both(name, part, value, figure=None):
 
 
 def set_weight(meta, arrays):
-    """With the hash of the policy made anew."""
-    arrays["controller/policy.pi.net.layers.0.weight"][0, 0, 0] += 1e-3
+    """Wherever the policy is told, and its hash made anew."""
+    for part in ("controller/", "V/controller."):
+        arrays[f"{part}policy.pi.net.layers.0.weight"][0, 0, 1] += 0.5
     own = {k[11:]: v for k, v in arrays.items() if k.startswith("controller/")}
     meta["policy"] = store.hash_arrays(own)
 
@@ -389,6 +390,27 @@ FORGERIES = {
     "extra-proof-in-due-form": set_proof,
     "extra-closed-form": set_extra("closed-form", "ClosedForm", evidence="proved", claim="proved"),
     "extra-safety-case": set_extra("safety-case", "SafetyCase", claim="certified to SIL 4"),
+    "linearisation-radius": put(
+        (V + "linearisation/bound", 0.5), (V + "linearisation/figures/spectral_radius", 0.5)
+    ),
+    "linearisation-claim": put((V + "linearisation/claim", "globally exponentially stable")),
+    "linearisation-proved": put((V + "linearisation/evidence", "proved")),
+    "linearisation-scope": put((V + "linearisation/scope/starts", "everywhere")),
+    "linearisation-margin": put(*both("linearisation", "margin", -0.5)),
+    "linearisation-scenes": put(*both("linearisation", "scenes", 10**6)),
+    "linearisation-trials": put((V + "linearisation/trials", 10**9)),
+    "apart-gap": put((V + "apart/figures/gap", 0.3)),
+    "apart-gap-claimed": put(
+        (V + "apart/figures/gap", 0.3),
+        (V + "apart/claim", lambda old: old.replace("than 0", "than 0.3 m")),
+    ),
+    "information": put(("information", "each agent acts on nothing")),
+    "information-in-scope": put((V + "reach/scope/information", "no communication is needed")),
+    "left-out": put(("left_out", {"safe": "it was certified to SIL 4 elsewhere"})),
+    "left-out-unknown": put(("left_out", {"safety-case": "certified to SIL 4"})),
+    "left-out-and-in": put(("left_out", {"reach": "it was certified elsewhere"})),
+    "left-out-V": put(("left_out", {"apart": "V, as before, is 3 on the target set"})),
+    "extra-safe": set_extra("safe", "Safe", claim="no two robots ever collide"),
     "extra-safety-case-alone": set_extra("safety-case", None, claim="certified to SIL 4"),
 }
 
@@ -520,6 +542,39 @@ def test_a_certificate_without_one_of_its_arrays_is_rejected(bundle, tmp_path):
         target = altered(bundle[0], tmp_path / str(number), lambda _, a, name=name: a.pop(name))
         with pytest.raises(Rejected):
             recheck(target)
+
+
+@pytest.mark.parametrize("dynamics", [Unicycle(), DoubleIntegrator()])
+def test_what_a_linearisation_does_not_show_cannot_be_claimed(
+    dynamics, tmp_path, quick_compilation
+):
+    """A unicycle that no feedback moves sideways, and a goal that is no equilibrium."""
+    game = Rendezvous(agents=2, horizon=20, dynamics=dynamics, rest_weight=0.5)
+    controller = Decentralised(Greedy(Actors(shape(game), 4, key=jax.random.key(2))), game)
+    turns = isinstance(dynamics, Unicycle)
+    V, table = Quadratic(jnp.eye(4)), {"linearisation": Linearisation(scenes=2)}
+    if turns:
+        table["contraction"] = Contraction(rollouts=100, calibration=100, T=9, share=0.1)
+        table["safe"] = Safe(rollouts=100, share=0.1)
+    result = certify(game, controller, table, seed=1, confidence=0.9, V=V)
+    save(tmp_path / "c", result, game, controller, V)
+    found = recheck(tmp_path / "c")
+    assert found["agrees"] and not found["holds"] and {*result["left_out"]} <= {"safe"}
+    claim = result["verdicts"]["linearisation"]["claim"]
+    assert ("NO: " if turns else "no equilibrium") in claim
+    said = "verdicts/linearisation/"
+    for number, lie in enumerate(
+        (
+            put((said + "holds", True), ("holds", True)),
+            put((said + "claim", claim.replace("NO: ", "").replace("no ", "an "))),
+            put((said + "evidence", "observed" if turns else "proved")),
+            put((said + "figures/uncontrollable_eigenvalues", [0.5])),
+            put((said + "figures/action_at_goal", 0.0)),
+            lambda meta, arrays: meta["left_out"].update(apart="a team of one"),
+        )
+    ):
+        with pytest.raises(Rejected):
+            recheck(altered(tmp_path / "c", tmp_path / str(number), lie))
 
 
 # --- Files ---------------------------------------------------------------------------------------
@@ -767,6 +822,14 @@ def test_its_world_is_the_same(dynamics, kind, change):
         assert np.allclose(sim.cost(found)[2, :15], seen.cost.mean(axis=1), rtol=1e-4)
         values = eqx.filter_jit(V.along)(game, seen, 16)
         assert np.allclose(sim.values(found, 16)[2], values, rtol=1e-3, atol=1e-4)
+
+
+def test_its_double_random_numbers_are_the_seeds_own():
+    key = jax.random.fold_in(jax.random.key(3), 5)
+    own = fold((np.zeros(1, np.uint32), np.array([3], np.uint32)), 5)
+    with jax.enable_x64(True):
+        drawn = np.asarray(jax.random.uniform(key, (50, 7)))
+    assert drawn.dtype == float and np.array_equal(uniform64(own, 50, 7)[0], drawn)
 
 
 def test_its_random_numbers_are_the_seeds_own():

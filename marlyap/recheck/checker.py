@@ -6,6 +6,7 @@ and writes claims, scopes and worst cases anew. All of it has to be what the fil
 asked. What it does not know it refuses by name; what no rollout can show it lists as not checked.
 """
 
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -50,6 +51,10 @@ ASKED = {
     "Proof": dict(c=NUMBER, rho=NUMBER, inner=NUMBER, half=LIST, eta=NUMBER, decay=NUMBER)
     | dict(most=WHOLE, batch=WHOLE, resume=(str, NONE), show=FLAG),
 }
+# Between which numbers, both left out, what is asked for has to lie.
+RANGES: dict[str, tuple[float, float]] = dict(share=(0, 1), q=(0, 1), beta=(0, math.inf))
+RANGES |= dict(rollouts=(0, math.inf), calibration=(0, math.inf), T=(0, math.inf))
+RANGES |= dict(stay=(-1, math.inf), margin=(0, 1), decay=(-1e-300, 1), scenes=(0, 1001))
 CHECKS: dict[str, Callable[[Case], dict[str, Any]]] = {
     "Reach": checks.reach,
     "ReachAndStay": checks.reach,
@@ -154,6 +159,9 @@ def kind_of(name: str, asked: Any) -> str:
     if name != usual(kind):
         raise Rejected(f"certificate: a {kind} is called {usual(kind)}, not {name}.")
     record(f"what is asked of {name}", asked, ASKED[kind] | dict(kind=TEXT, confidence=(float,)))
+    for key, (low, high) in RANGES.items():
+        if key in asked and not low < asked[key] < high:
+            raise Rejected(f"certificate: {key} of {name}, {asked[key]}, is impossible.")
     return kind
 
 

@@ -35,12 +35,21 @@ class Rejected(UserError):
 
 
 def agree(what: str, found: Any, said: Any) -> None:
-    """Raise Rejected unless both are the same JSON, so that neither 1.0 nor true passes for 1."""
-    if json.dumps(found, sort_keys=True) != json.dumps(said, sort_keys=True):
-        short = lambda value: value if isinstance(value, str) else f"{value!r:.200}"
-        raise Rejected(
-            f"certificate: {what} is {short(found)}, not {short(said)} as the file says."
-        )
+    """Raise Rejected unless both are the same JSON, so that neither 1.0 nor true passes for 1.
+
+    Of objects it names the first part that differs.
+    """
+    if json.dumps(found, sort_keys=True) == json.dumps(said, sort_keys=True):
+        return
+    if isinstance(found, dict) and isinstance(said, dict):
+        for key in [*said, *found]:
+            if key not in found or key not in said:
+                has = "nothing that recheck knows" if key not in found else "missing"
+                raise Rejected(f"certificate: {key!r} of {what} is {has}.")
+            agree(f"{key} of {what}", found[key], said[key])
+    short = lambda value: value if isinstance(value, str) else f"{value!r:.200}"
+    told = f"not {short(said)} as the file says"
+    raise Rejected(f"certificate: {what} is {short(found)}, {told}.")
 
 
 def record(what: str, value: Any, types: dict[str, tuple[type, ...]]) -> None:

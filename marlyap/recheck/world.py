@@ -49,6 +49,8 @@ class World:
         self.used = {"controller/words"}
         self.known()
         record("the game", self.game, GAME)
+        if not 1 <= self.game["agents"] <= 4096 or not self.game["horizon"] >= 1:
+            raise Rejected("certificate: its number of agents or its horizon is impossible.")
         model = self.game["dynamics"]
         record("the dynamics", model, DYNAMICS)
         self.kind, self.limits = model["kind"], np.array(model["limits"], float)
