@@ -49,7 +49,7 @@ class Run:
     @classmethod
     def create(
         cls,
-        directory: Path,
+        directory: Path | str,
         trainer: Trainer,
         seed: int,
         names: dict[str, str],
@@ -60,6 +60,7 @@ class Run:
         Raises UserError if it exists, unless `force` empties it, or if the task returns a wrong
         shape.
         """
+        directory = Path(directory)
         sound(trainer.game)
         cls.vacant(directory, force)
         if directory.exists():
@@ -117,7 +118,7 @@ class Run:
     @classmethod
     def open(
         cls,
-        directory: Path,
+        directory: Path | str,
         game: AbstractGame | None = None,
         algorithm: AbstractAlgorithm | None = None,
     ) -> "Run":
@@ -125,6 +126,7 @@ class Run:
 
         Raises UserError if the directory is not a run, or was changed, or is from a newer version.
         """
+        directory = Path(directory)
         if not (directory / "run.json").is_file():
             raise UserError(f"run: {directory} is not a run (it has no run.json).")
         about = store.read_json(directory / "run.json")
@@ -319,13 +321,13 @@ def sound(game: AbstractGame) -> None:
         raise UserError(f"task: {f'{place}: ' if place else ''}{fault}")
 
 
-def expand(paths: Iterable[Path]) -> list[Path]:
+def expand(paths: Iterable[Path | str]) -> list[Path]:
     """Run directories: those given, and those one level below the others.
 
     Raises UserError where there is none, or one is given twice.
     """
     found: list[Path] = []
-    for path in paths:
+    for path in map(Path, paths):
         here = [path] if (path / "run.json").exists() else sorted(path.glob("*/run.json"))
         if not here:
             raise UserError(f"run: {path} is not a run and holds none.")
