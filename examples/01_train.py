@@ -1,4 +1,4 @@
-"""Train a team in memory, measure it on fresh starts, and say with what certainty."""
+"""Train a team in memory and measure its success on fresh starts, with a 95 % interval."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""A task of one's own in one file: the team gathers in a corner that only its leader sees.
+"""Your own task in one file: the team gathers in a corner that only its leader knows.
 
 From the command line: marlyap train examples/02_own_task.py:Corner masac
 """
@@ -12,10 +12,10 @@ from marlyap.tasks.rendezvous import scatter
 
 
 class Corner(AbstractGame):
-    """The goal is one of the four corners; only agent 0 knows which."""
+    """The goal is one of the four corners; only agent 0 knows which one."""
 
     agents: int = 3
-    leaders: tuple[int, ...] = (0,)  # the agents that see the corner
+    leaders: tuple[int, ...] = (0,)  # the agents that know the corner
     graph: str = "star"
     size: float = 1.0  # half the side of the square (m)
     radius: float = 0.15  # an agent has arrived when it is this close (m)

@@ -1,4 +1,4 @@
-"""Open a run, evaluate it, and draw: paths as PNG, an episode as GIF, all of it as one HTML page.
+"""Open a run, evaluate it, and draw it: paths as PNG, an episode as GIF, a report as HTML.
 
 Make the run first: marlyap train rendezvous masac-lyapunov --out runs/mine
 """

@@ -1,4 +1,4 @@
-"""Train on disk, stop in the middle, go on later: bit for bit as if nothing had happened."""
+"""Train on disk, stop halfway and resume: the result equals an uninterrupted run bit for bit."""
 
 import argparse
 from itertools import count
@@ -15,7 +15,7 @@ def main(place: Path, steps: int, **smaller: int):
 
     half = -(-trainer.iterations // 2)
     for _ in range(2):
-        asked = count()  # `stop` is asked before every iteration; a signal could answer as well
+        asked = count()  # `stop` is called before every iteration
         for event in fit([run], stop=lambda asked=asked: next(asked) >= half):
             print(event["iteration"], round(event["return"], 2))
         run = Run.open(place / "seed0")  # as another process would, tomorrow

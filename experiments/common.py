@@ -5,7 +5,10 @@ An experiment NAME on a task leaves in `--results`
     NAME-TASK-curves.csv       one row for each case, seed and iteration
     NAME-TASK-contraction.csv  one row for each case and seed: how often the cost contracts by BETA
                                over T steps, and by how much (beta98) from 98 % of the starts
-    NAME-TASK-success.csv      one row for each case, seed and radius, with its exact 95 % interval
+    NAME-TASK-success.csv      one row for each case, seed and radius, with its exact 95 % interval;
+                               the share of episodes at rest and of those that stay for ten
+                               horizons, median final speed (m/s) and spin (rad/s) of the fastest
+                               agent, the policy's hash, and where the row was made
     NAME-TASK.png, .json       the figure, and curves and success in the schema of marl-eval
 
 A row that is there is not made again: started anew, a script goes on where it was. Runs are kept in
@@ -34,12 +37,14 @@ from marlyap.algorithm import AbstractAlgorithm
 from marlyap.certificates.contraction import Contraction
 from marlyap.config import fields
 from marlyap.errors import UserError
-from marlyap.evaluation import RADII, outcome, share
+from marlyap.evaluation import RADII, Evaluation, evaluate, share
 from marlyap.fit import fit
 from marlyap.game import AbstractGame
+from marlyap.identity import policy_hash
 from marlyap.marl_eval import document
+from marlyap.provenance import provenance
 from marlyap.report import PALETTE
-from marlyap.rollout import rollout, until
+from marlyap.rollout import rollout
 from marlyap.run import Run
 from marlyap.seeds import stream
 from marlyap.store import write_text_atomic
@@ -97,7 +102,7 @@ def options(doc: str, **defaults: Any) -> argparse.Namespace:
     p.add_argument("--task", default=o["task"], choices=list(TASKS))
     p.add_argument("--steps", type=int, default=o["steps"], help="environment steps of each run")
     p.add_argument("--seeds", type=int, nargs="+", default=list(o["seeds"]), help="of training")
-    p.add_argument("--episodes", type=int, default=o["episodes"], help="fresh starts")
+    p.add_argument("--episodes", type=int, default=o["episodes"], help="held-out starts")
     p.add_argument("--only", default="", help="only this case, or those with this in their names")
     p.add_argument("--list", action="store_true", help="name the cases and stop")
     p.add_argument("--runs", type=Path, default=Path("runs/experiments"), help="where runs go")
@@ -175,7 +180,8 @@ def fill(name: str, cases: Sequence[Case], args: argparse.Namespace) -> None:
         if not run.finished:  # given up
             continue
         about = case.about | {"seed": seed}
-        final, falls = measure(run.game, run.controller(), args.episodes)
+        controller = run.controller()
+        found, falls = measure(run.game, controller, args.episodes)
         kept = ("steps", "updates", "success", "return")
         history = run.history()
         looks = [line for line in history if "success" in line or len(history) <= 200]
@@ -184,7 +190,8 @@ def fill(name: str, cases: Sequence[Case], args: argparse.Namespace) -> None:
         by = {"beta98": float(np.sort(falls)[len(falls) - round(MOST * len(falls))])}
         contraction = about | {"T": T, "beta": BETA} | counted(falls >= BETA) | by
         put(args, f"{name}-contraction", columns, [contraction])
-        success = [about | {"radius": r} | counted(final <= r) for r in RADII]
+        made = after(found) | {"policy": policy_hash(controller)} | provenance()
+        success = [about | {"radius": r} | counted(found.final <= r) | made for r in RADII]
         put(args, f"{name}-success", columns, success)
         if not args.keep:
             shutil.rmtree(run.directory / "checkpoints", ignore_errors=True)
@@ -212,23 +219,32 @@ def train(runs: list[Run], args: argparse.Namespace) -> None:
 
 
 @eqx.filter_jit
-def _measure(game: AbstractGame, controller: Any, keys: Any) -> tuple[Any, Any]:
+def _falls(game: AbstractGame, controller: Any, keys: Any) -> Any:
     def one(key):
         k_start, k_act = jax.random.split(key)
         long = rollout(game, controller, game.reset(k_start), k_act, game.horizon + 1)
-        found = Contraction(T=min(T, game.horizon)).judge(game, None, long, k_act)
-        return outcome(game, until(long, game.horizon)).final, found.figures["beta"]
+        return Contraction(T=min(T, game.horizon)).judge(game, None, long, k_act).figures["beta"]
 
     return jax.vmap(one)(keys)
 
 
-def measure(game: AbstractGame, controller: Any, episodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """From the starts of `marlyap evaluate`: final distances (m), and how the cost contracts.
+def measure(
+    game: AbstractGame, controller: Any, episodes: int, beyond: int | None = None
+) -> tuple[Evaluation, np.ndarray]:
+    """From the starts of `marlyap evaluate`: what it finds there, and how the cost contracts.
 
     By that share of itself, at least, it falls over every T steps that begin above the radius.
     """
-    final, least = _measure(game, controller, jax.random.split(stream(0, "evaluate"), episodes))
-    return np.asarray(final), np.asarray(least)
+    found = evaluate(game, controller, episodes, beyond=beyond)
+    falls = _falls(game, controller, jax.random.split(stream(0, "evaluate"), episodes))
+    return found, np.asarray(falls)
+
+
+def after(found: Evaluation) -> Row:
+    """Columns for what the team does once it has arrived."""
+    stayed = float(np.mean(found.stayed)) if found.beyond else ""  # a plan ends at the horizon
+    still = {"at_rest": float(np.mean(found.at_rest)), "stayed": stayed}
+    return still | {"speed": float(np.median(found.speed)), "spin": float(np.median(found.spin))}
 
 
 def counted(hits: np.ndarray) -> Row:
@@ -260,7 +276,8 @@ def read(args: argparse.Namespace, name: str) -> list[dict[str, str]]:
 
 
 NUMBERS = (
-    "radius episodes successes success_rate low high T beta beta98 steps updates success return"
+    "radius episodes successes success_rate low high T beta beta98 steps updates success return "
+    "at_rest stayed speed spin policy machine cpu commit"
 ).split()
 
 
@@ -277,12 +294,18 @@ def labels(rows: Sequence[Row]) -> list[str]:
 
 
 class Estimate(NamedTuple):
-    """Interquartile mean over seeds, its 95 % interval over seeds and episodes, and the seeds'."""
+    """Interquartile mean over seeds, its 95 % interval over seeds and episodes, and the seeds'.
+
+    That interval is a bootstrap's, which covers less than it says with few seeds
+    (reliability/coverage.py has measured how much). `expected` is the interval for the plain mean
+    of a rate over training seeds, which holds whatever their distribution.
+    """
 
     mean: float
     low: float
     high: float
     seeds: np.ndarray
+    expected: statistics.Interval | None  # None for what is not a share
 
 
 def estimate(rows: Iterable[Row]) -> Estimate:
@@ -300,7 +323,12 @@ def estimate(rows: Iterable[Row]) -> Estimate:
         low, high = statistics.clopper_pearson(*counts[0], 0.95)
     else:
         low = high = rates[0]
-    return Estimate(statistics.iqm(rates), low, high, rates)
+    share = bool(np.all((rates >= 0) & (rates <= 1)))
+    expected = statistics.mean_interval(rates) if share and len(rows) > 1 else None
+    return Estimate(statistics.iqm(rates), low, high, rates, expected)
+
+
+AFTER = {"at_rest": "at rest at the last step", "stayed": "stays for ten horizons"}
 
 
 def measured(args: argparse.Namespace, name: str) -> dict[str, dict[str, list[Row]]]:
@@ -310,6 +338,12 @@ def measured(args: argparse.Namespace, name: str) -> dict[str, dict[str, list[Ro
     groups: dict[str, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
     for row, case in zip(success, labels(success), strict=True):
         groups[f"success within {row['radius']} m"][case].append(row)
+    for row, case in zip(success, labels(success), strict=True):
+        for column, name in AFTER.items():
+            if row["radius"] == f"{RADIUS:g}" and row.get(column):
+                count = round(float(row[column]) * int(row["episodes"]))
+                about = row | {"success_rate": row[column], "successes": str(count)}
+                groups[name][case].append(about)
     for row, case in zip(contraction, labels(contraction), strict=True):
         groups[f"cost falls by {row['beta']} in {row['T']} steps"][case].append(row)
         if row.get("beta98"):
@@ -323,10 +357,15 @@ def forest(args: argparse.Namespace, name: str) -> None:
     tables = measured(args, name)
     found = {m: {c: estimate(rows) for c, rows in by.items()} for m, by in tables.items()}
     for measure, cases in found.items():
-        print(f"{name}, {measure}: interquartile mean over seeds, 95 % interval, mean, worst seed")
+        print(f"{name}, {measure}: interquartile mean over seeds with its bootstrap interval; mean")
+        print("  with its interval for the expectation over training seeds (95 % each); worst seed")
         for case, e in cases.items():
-            worst = f"{e.seeds.mean():.4f} {e.seeds.min():.3f} of {len(e.seeds)}"
+            mean = f"{e.seeds.mean():.4f}"
+            if e.expected is not None:
+                mean += f" [{e.expected.low:.4f}, {e.expected.high:.4f}]"
+            worst = f"{mean}  {e.seeds.min():.3f} of {len(e.seeds)}"
             print(f"  {case:<44} {e.mean:.4f} [{e.low:.4f}, {e.high:.4f}]  {worst}")
+    speeds(args, name)
     order = list(dict.fromkeys(case for cases in found.values() for case in cases))
     figure, panels = canvas(len(found), 3.0, 0.9 + 0.24 * len(order))
     for axes, (measure, cases) in zip(panels, found.items(), strict=True):
@@ -342,11 +381,30 @@ def forest(args: argparse.Namespace, name: str) -> None:
     save(figure, args.results / f"{name}.png")
 
 
+def speeds(args: argparse.Namespace, name: str) -> None:
+    """On standard output: how fast the teams of each case still are at the last step."""
+    rows = [r for r in read(args, f"{name}-success") if r["radius"] == f"{RADIUS:g}"]
+    found = defaultdict(list)
+    for row, case in zip(rows, labels(rows), strict=True):
+        if row.get("speed"):
+            found[case].append((float(row["speed"]), float(row["spin"])))
+    if found:
+        print(
+            f"{name}: final speed (m/s) and spin (rad/s) of the fastest agent; median seed, worst"
+        )
+    for case, pairs in found.items():
+        (speed, spin), (fast, turning) = np.median(pairs, axis=0), np.max(pairs, axis=0)
+        print(f"  {case:<44} {speed:.3f} {spin:.2f}  {fast:.3f} {turning:.2f} of {len(pairs)}")
+
+
 def improvements(args: argparse.Namespace, name: str, plain: str) -> None:
     """On standard output: how probably each case is above the plain one, measure by measure."""
     rates = lambda rows: [float(row["success_rate"]) for row in rows]
     for measure, cases in measured(args, name).items():
         for case in [c for c in cases if c != plain and plain in cases]:
+            if min(len(cases[case]), len(cases[plain])) < 2:
+                print(f"P({case} above {plain}) needs two seeds or more of each, {measure}")
+                continue
             better = statistics.probability_of_improvement
             p, (low, high) = better(rates(cases[case]), rates(cases[plain]))
             print(f"P({case} above {plain}) = {p:.2f} [{low:.2f}, {high:.2f}], {measure}")

@@ -6,13 +6,18 @@ of other keys. Without --quick it needs casadi.
 
 import argparse
 import csv
+import io
 import itertools
-import sys
 from pathlib import Path
+
+from common import after
 
 from marlyap.controllers import CONTROLLERS, Cascade, OptimalControl
 from marlyap.dynamics import Unicycle
 from marlyap.evaluation import RADII, evaluate, share
+from marlyap.identity import policy_hash
+from marlyap.provenance import provenance
+from marlyap.store import write_text_atomic
 from marlyap.tasks.rendezvous import Rendezvous
 
 
@@ -39,27 +44,37 @@ SETTINGS = [
     (5, "path", 1, 5.0, 100),
 ]
 COLUMNS = "controller agents graph leaders limit horizon radius episodes successes rate low high"
+AFTER = "seed at_rest stayed speed spin policy machine cpu commit"
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="two settings, 200 episodes, printed")
     quick = parser.parse_args().quick
-    table = csv.writer(sys.stdout if quick else RESULTS.open("w", newline=""), lineterminator="\n")
-    table.writerow([*COLUMNS.split(), "seed"])
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow([*COLUMNS.split(), *AFTER.split()])
     for n, graph, leaders, limit, horizon in SETTINGS[2::7] if quick else SETTINGS:
         team = {"agents": n, "graph": graph, "leaders": tuple(range(leaders)), "horizon": horizon}
         game, final = Rendezvous(**team, dynamics=Unicycle(limits=(limit, limit))), {}
         for name, gains in VARIANTS.items():
             controller = CONTROLLERS[name.split(",")[0]](game, **gains)
-            final[name] = evaluate(game, controller, 200 if quick else 4000, SEED).final
+            final[name] = evaluate(game, controller, 200 if quick else 4000, SEED), controller
         if (n, graph, leaders, horizon) == (3, "complete", 1, 40) and not quick:
-            final["optimal-control"] = evaluate(game, OptimalControl(game), 50, SEED).final
+            planner = OptimalControl(game)
+            final["optimal-control"] = evaluate(game, planner, 50, SEED), planner
         for name, radius in itertools.product(final, RADII):
-            s = share(final[name] <= radius, 0.95)
+            found, controller = final[name]
+            s = share(found.final <= radius, 0.95)
             counts = (s["episodes"], s["successes"], s["success_rate"])
             ends = (round(x, 4) for x in s["interval"])
-            table.writerow((name, n, graph, leaders, limit, horizon, radius, *counts, *ends, SEED))
+            about = (name, n, graph, leaders, limit, horizon, radius)
+            made = (policy_hash(controller), *provenance().values())
+            table.writerow((*about, *counts, *ends, SEED, *after(found).values(), *made))
+    if quick:
+        print(text.getvalue(), end="")
+    else:
+        write_text_atomic(RESULTS, text.getvalue())
 
 
 if __name__ == "__main__":

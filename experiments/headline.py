@@ -47,7 +47,7 @@ def curves(args, name):
     runs = [
         {
             "label": f"{algorithm} seed {seed}",
-            "algorithm": algorithm,
+            "group": algorithm,
             "seed": int(seed),
             "log": [{k: float(r[k]) for k in ("steps", "success", "return")} for r in rows],
         }

@@ -13,6 +13,7 @@ from dataclasses import replace
 from common import (
     RADIUS,
     Case,
+    after,
     counted,
     experiment,
     options,
@@ -47,4 +48,7 @@ if __name__ == "__main__":
         row = counted(by_hand.final <= RADIUS)
         rows = [r for r in read(args, f"model-based-{args.task}-success")]
         rates = [float(r["success_rate"]) for r in rows if float(r["radius"]) == RADIUS]
-        print(f"tree-pursuit {row}; learnt, worst seed {min(rates):.4f} of {len(rates)}")
+        print(
+            f"tree-pursuit {row}, {after(by_hand)}; "
+            f"learnt, worst seed {min(rates):.4f} of {len(rates)}"
+        )

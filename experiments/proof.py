@@ -26,8 +26,10 @@ from marlyap.certificates.proof import Proof, extents
 from marlyap.certify import certify, save
 from marlyap.lyapunov_function import Approach
 from marlyap.nets import Actors, Greedy, Shape
+from marlyap.provenance import provenance
 from marlyap.rollout import Decentralised
 from marlyap.seeds import stream
+from marlyap.store import write_text_atomic
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State
 
@@ -151,7 +153,9 @@ def main():
         "share_of_starts": float(share),
         "seconds": round(seconds, 1),
     }
-    place.with_suffix(".json").write_text(json.dumps(summary | verdict, indent=1) + "\n")
+    made = {"policy": result["policy"]} | provenance()
+    text = json.dumps(summary | verdict | made, indent=1) + "\n"
+    write_text_atomic(place.with_suffix(".json"), text)
     print(f"{verdict['claim']} ({verdict['figures']['boxes']} boxes, {seconds:.0f} s).")
 
 

@@ -1,7 +1,7 @@
 """Trained policies in a game that is not quite the one they were made for.
 
 The policies are those of headline.py (trained here if they are not there), but for the strict
-condition's, and the hand-written tree pursuit beside them; all from the same fresh starts.
+condition's, and the hand-written tree pursuit beside them; all from the same held-out starts.
 
     ./run python experiments/robustness.py
 """
@@ -10,6 +10,7 @@ from collections import defaultdict
 
 from common import (
     RADIUS,
+    after,
     canvas,
     counted,
     estimate,
@@ -26,7 +27,9 @@ from headline import cases
 from marlyap import statistics
 from marlyap.certificates.robustness import moved
 from marlyap.controllers import CONTROLLERS
+from marlyap.identity import policy_hash
 from marlyap.perturb import Perturbed, edge_to_cut, follower_to_lose, traced
+from marlyap.provenance import provenance
 from marlyap.tasks import TASKS
 
 
@@ -86,9 +89,10 @@ def table(args):
         for kind, level, other in perturbed(game, args.quick):
             key = (args.task, algorithm, seed, kind, level)
             if tuple(map(str, key)) not in there:
-                final, _ = measure(other, moved(controller, other), args.episodes)
+                found, _ = measure(other, moved(controller, other), args.episodes)
                 about = dict(zip(COLUMNS, key, strict=True)) | {"radius": RADIUS}
-                put(args, name, COLUMNS, [about | counted(final <= RADIUS)])
+                made = after(found) | {"policy": policy_hash(controller)} | provenance()
+                put(args, name, COLUMNS, [about | counted(found.final <= RADIUS) | made])
 
 
 def beside(kind, algorithm, points, algorithms):

@@ -73,6 +73,9 @@ EXAMPLES = {
 }
 
 
+SEED = "of the starts (default 0), or the word draw for starts that nobody has seen"
+
+
 class Parser(argparse.ArgumentParser):
     """Errors are one sentence and exit code 2, like every other bad input."""
 
@@ -111,6 +114,11 @@ def number(text: str) -> int:
         return whole(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number") from None
+
+
+def seed_of_starts(text: str) -> int | str:
+    """A whole number, or the word draw."""
+    return text if text == "draw" else number(text)
 
 
 def place(text: str) -> Path:
@@ -180,12 +188,13 @@ def parser() -> Parser:
     )
     p.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
 
-    p = verb("evaluate", "measure runs or hand-written controllers on fresh starts", SUBJECT)
+    p = verb("evaluate", "measure runs or hand-written controllers on held-out starts", SUBJECT)
     p.add_argument("runs", nargs="+", metavar="RUN", help="run directories or controller names")
     on(p, "the task to measure on (default: that of each run; needed for controllers)")
-    p.add_argument("--episodes", type=number, default=500, help="fresh starts (default 500)")
-    p.add_argument("--seed", type=number, default=0, help="of the starts (default 0)")
+    p.add_argument("--episodes", type=number, default=500, help="held-out starts (default 500)")
+    p.add_argument("--seed", type=seed_of_starts, default=0, help=SEED)
     p.add_argument("--confidence", type=float, default=0.95, help="of the intervals")
+    p.add_argument("--out", type=place, default=None, help="file for the figures, as JSON")
 
     p = verb("certify", "say what holds of a run or controller, with what evidence", SUBJECT)
     p.add_argument("run", metavar="RUN", help="a run directory or a controller name")
@@ -211,15 +220,16 @@ def parser() -> Parser:
 
     p = verb("report", "write one HTML file (and PNGs) about runs", SUBJECT)
     p.add_argument("runs", type=place, nargs="+", metavar="RUN", help="run directories")
-    p.add_argument("--out", type=place, default=None, help="HTML file (default in the first run)")
-    p.add_argument("--episodes", type=number, default=500, help="fresh starts (default 500)")
-    p.add_argument("--seed", type=number, default=0, help="of the starts (default 0)")
+    where = "HTML file (default: in the run; of several runs, ./report.html)"
+    p.add_argument("--out", type=place, default=None, help=where)
+    p.add_argument("--episodes", type=number, default=500, help="held-out starts (default 500)")
+    p.add_argument("--seed", type=seed_of_starts, default=0, help=SEED)
     on(p, "the task to measure on (default: that of each run)")
 
     p = verb("watch", "film one episode of a run, as GIF and HTML", SUBJECT)
     p.add_argument("run", type=place, metavar="RUN", help="a run directory")
     p.add_argument("--episode", type=number, default=0, help="which of the evaluation starts")
-    p.add_argument("--seed", type=number, default=0, help="of the starts (default 0)")
+    p.add_argument("--seed", type=seed_of_starts, default=0, help=SEED)
     p.add_argument(
         "--out", type=place, default=None, help="where to put the film (default: the run)"
     )

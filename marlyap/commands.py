@@ -3,12 +3,13 @@
 import dataclasses
 import json
 import re
+import secrets
 import shlex
 import shutil
 import sys
 import time
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, cast
@@ -18,23 +19,24 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from marlyap import config, film, store
+from marlyap import config, film, groups, store
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.algorithms import ALGORITHMS, PRESETS
-from marlyap.certificate import Verdict
+from marlyap.certificate import arrival, sentence
 from marlyap.certificates import CERTIFICATES
+from marlyap.certificates.safety import has_rules
 from marlyap.certify import certify, save
 from marlyap.conformance import conformance
 from marlyap.controllers import CONTROLLERS
 from marlyap.errors import UserError, within
-from marlyap.evaluation import Evaluation, compare, evaluate, pooled
+from marlyap.evaluation import RESTS, evaluate
 from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import cost_sum
 from marlyap.recheck import recheck
-from marlyap.report import Film, Page, html
+from marlyap.report import MARK, Film, Page, html
 from marlyap.run import Run, expand
 from marlyap.seeds import stream
-from marlyap.subject import asked, changed
+from marlyap.subject import asked, refuse_all_but_task, subject
 from marlyap.tasks import TASKS
 from marlyap.trainer import SCHEDULES, Trainer, schedule_for
 from marlyap.workers import train_all
@@ -152,104 +154,148 @@ def seeds(words: list[str]) -> list[int]:
 
 
 def measure(args: Namespace, overrides: Overrides) -> Result:
-    """`evaluate`: every run and controller on the same fresh starts."""
+    """`evaluate`: every run and controller on the same held-out starts."""
     if not 0 < args.confidence < 1:
         raise UserError(f"confidence: {args.confidence} must lie between 0 and 1.")
-    game, algorithm = own_code(args, overrides if args.task else {})
-    found: list[tuple[str, str, Any, Evaluation]] = []
+    if args.out is not None and not args.out.parent.is_dir():
+        raise UserError(f"out: there is no directory {args.out.parent}.")
+    starts = starts_of(args.seed)
+    refuse_all_but_task(overrides)
+    game = asked(args.task, overrides) if args.task else None
+    found: list[groups.Measured] = []
     directories = []
     for word in args.runs:
         if word in CONTROLLERS:
             if game is None:
                 raise UserError(f"task: {word} needs --task, the task it is to be measured on.")
-            result = evaluate(game, CONTROLLERS[word](game), args.episodes, args.seed)
-            found.append((word, word, None, result))
+            result = evaluate(game, CONTROLLERS[word](game), args.episodes, starts)
+            found.append(groups.of_controller(word, game, result, starts))
         elif Path(word).exists():
             directories.append(Path(word))
         else:
             hint = config.suggest(word, CONTROLLERS)
             raise UserError(f"run: there is no run or controller '{word}'; {hint}")
+    notes = []
     for directory in expand(directories):
-        run = Run.open(directory, game, algorithm)
-        there = changed(run.game, overrides)
-        controller = run.controller(there) if overrides else run.controller()
-        result = evaluate(there, controller, args.episodes, args.seed)
-        found.append((str(directory), group(run), run, result))
-    rows = [
-        {"name": name, "group": g, "seed": run.seed if run else None} | e.summary(args.confidence)
-        for name, g, run, e in found
-    ]
-    for (_, _, run, _), row in zip(found, rows, strict=True):
-        if run and not overrides:
-            store.write_text_atomic(
-                run.directory / "evaluation.json", json.dumps(row, indent=1) + "\n"
-            )
-    names = list(dict.fromkeys(g for _, g, _, _ in found))
-    together = {n: pooled([e for _, g, _, e in found if g == n]) for n in names}
-    groups = [{"group": n} | e.summary(args.confidence) for n, e in together.items()]
-    pairs = comparisons(found)
-    whole = pooled([e for *_, e in found]).summary(args.confidence)
+        run, there = subject(directory, args.task, args.algorithm, overrides)
+        notes += run.warnings
+        result = evaluate(there, run.controller(there), args.episodes, starts)
+        found.append(groups.of_run(run, result, starts, there, args.task or ""))
+        done, whole = film.progress(run)
+        if done < whole:
+            notes.append(f"{directory}: training is unfinished ({done} of {whole} steps).")
+        if groups.same_game(there, run.game):
+            notes += keep(run, row_of(found[-1], args.confidence))
+    result = {
+        "start_seed": starts,
+        "runs": [row_of(m, args.confidence) for m in found],
+        "groups": [
+            {"group": name} | groups.summary(members, args.confidence)
+            for name, members in groups.grouped(found).items()
+        ],
+        "comparisons": groups.comparisons(found),
+    }
+    if len(result["groups"]) == 1:  # over several configurations there is nothing to say
+        result = {k: v for k, v in result["groups"][0].items() if k != "group"} | result
+    if args.out is not None:
+        store.write_text_atomic(args.out, json.dumps(result, indent=1) + "\n")
     if not args.json:
-        tabulate(rows, groups, pairs)
-    return whole | {
-        "start_seed": args.seed,
-        "runs": rows,
-        "groups": groups,
-        "comparisons": pairs,
-    }, 0
+        tabulate(result, found)
+    for note in notes:
+        say(note)
+    return result, 0
 
 
-def group(run: Run) -> str:
-    """Runs that differ in their seed alone belong together."""
-    preset = run.names["preset"]
-    return f"{run.names['task']} {run.names['algorithm']}" + (
-        f" ({preset})" if preset not in ("", "tuned") else ""
+def starts_of(seed: int | str) -> int:
+    """The seed of the starts; a fresh one for the word draw."""
+    return secrets.randbelow(2**31) if seed == "draw" else int(seed)
+
+
+def row_of(measured: groups.Measured, confidence: float) -> dict[str, Any]:
+    """One run's or controller's figures, with all that they depend on."""
+    about = {"name": measured.name, "group": measured.base, "seed": measured.seed}
+    about |= {"start_seed": measured.starts, "game": config.record(measured.game)}
+    return about | measured.evaluation.summary(confidence)
+
+
+def keep(run: Run, row: dict[str, Any]) -> list[str]:
+    """Leave the figures in the run; where that cannot be, say so."""
+    try:
+        store.write_text_atomic(run.directory / "evaluation.json", json.dumps(row, indent=1) + "\n")
+    except UserError as error:
+        return [f"evaluation.json was not written: {error}"]
+    return []
+
+
+def tabulate(result: dict[str, Any], found: Sequence[groups.Measured]) -> None:
+    """The evaluation as a table on standard output, and what it says in words."""
+    rows, teams = result["runs"], result["groups"]
+    first, asked = rows[0], {arrival(m.game) for m in found}
+    reached = asked.pop() if len(asked) == 1 else "as each task defines it"
+    ruled = any(has_rules(m.game) for m in found) or any(r["violations"]["successes"] for r in rows)
+    title = f"{first['episodes']} held-out starts of seed {result['start_seed']}; "
+    title += f"success at the last step: {reached}"
+    table = Table(
+        title=title,
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        padding=0,  # the box has a blank between columns; names need the room on 80 of them
     )
-
-
-def comparisons(found: list[tuple[str, str, Any, Evaluation]]) -> list[dict[str, Any]]:
-    """McNemar's test for every pair of different groups, on the starts they share."""
-    pairs = []
-    for i, (name_a, group_a, _, a) in enumerate(found):
-        for name_b, group_b, _, b in found[i + 1 :]:
-            if group_a != group_b and len(a.final) == len(b.final) and len(pairs) < 100:
-                pairs.append({"a": name_a, "b": name_b} | compare(a, b))
-    return pairs
-
-
-def tabulate(
-    rows: list[dict[str, Any]], groups: list[dict[str, Any]], pairs: list[dict[str, Any]]
-) -> None:
-    """The evaluation as a table on standard output."""
-    first, counts = rows[0], {row["episodes"] for row in rows}
-    title = f"{counts.pop()} fresh starts" if len(counts) == 1 else "fresh starts"
-    title += f"; success: all within {first['radius']:g} m at the last step"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("run", overflow="fold", min_width=16)
+    table.add_column("run", overflow="fold", min_width=10)
     percent = f"{100 * first['confidence']:g} %"
-    heads = "success", percent, "in 0.05", "median", "95 %", "settled"
-    for head in heads:
+    heads = ["success", percent, "rest", "stays", *["broken"] * ruled, "in .05"]
+    for head in [*heads, "median", "95 %", "m/s", "rad/s", "settled"]:
         table.add_column(head, justify="right", no_wrap=True)
-    number = lambda v, digits: "-" if v is None else f"{v:.{digits}f}"
-    several = len(rows) > len(groups)
-    for row in rows + (groups if several else []):
-        low, high = row["interval"]
-        table.add_row(
-            row.get("name") or f"all of {row['group']}",
-            f"{100 * row['success_rate']:.1f} %",
-            f"{100 * low:.1f}-{100 * high:.1f}",
-            f"{100 * row['radii'][0]['success_rate']:.1f} %",
-            number(row["final_distance"]["0.5"], 3),
-            number(row["final_distance"]["0.95"], 3),
-            number(row["settling_time"]["0.5"], 1),
-        )
+    by_name = {row["name"]: row for row in rows}
+    for members, team in zip(groups.grouped(found).values(), teams, strict=True):
+        for row in [by_name[m.name] for m in members]:
+            table.add_row(*cells(row, ruled))
+        if len(members) > 1:
+            table.add_row(*cells(team | {"name": team["about"]}, ruled))
     console = Console()
+    console = console if console.is_terminal else Console(width=max(console.width, 110))
     console.print(table)
-    console.print("median and 95 %: worst final distance (m); settled: median time (s)\n")
-    for pair in pairs:
+    console.print(
+        "success, rest (no agent above 0.1 m/s or 0.1 rad/s), stays (in every step until "
+        f"{1 + max(m.evaluation.beyond / m.game.horizon for m in found):g} horizons)"
+        + (", broken (episodes with a violation)" if ruled else "")
+        + ": % of the episodes; median and 95 %: worst final distance (m); m/s and rad/s: of the "
+        "fastest agent at the last step, median; settled: median time (s)\n",
+        highlight=False,
+    )
+    for team in teams:
+        console.print(f"{team['group']}: {groups.words(team)}", highlight=False, markup=False)
+    for row in rows:
+        if row["rests"] and row["rests"] != RESTS:
+            console.print(f"{row['name']}: {row['rests']}", highlight=False, markup=False)
+    for pair in result["comparisons"]:
         text = f"{pair['a']} against {pair['b']}: only the first {pair['only_a']}, "
         text += f"only the second {pair['only_b']}, McNemar p = {pair['p_value']:.2g}"
-        console.print(text, highlight=False)
+        console.print(text, highlight=False, markup=False)
+    if len(result["comparisons"]) == groups.MOST_PAIRS:
+        console.print(f"Only the first {groups.MOST_PAIRS} pairs are compared.", highlight=False)
+
+
+def cells(row: dict[str, Any], ruled: bool) -> list[str]:
+    """One line of the evaluation's table."""
+    number = lambda v, digits: "-" if v is None else f"{v:.{digits}f}"
+    share = lambda part: f"{100 * part['success_rate']:.1f}"
+    low, high = row["interval"]
+    return [
+        escape(row["name"]),
+        share(row),
+        f"{100 * low:.1f}-{100 * high:.1f}",
+        share(row["at_rest"]),
+        share(row["stayed"]) if row["beyond_steps"] else "-",
+        *[share(row["violations"])] * ruled,
+        share(row["radii"][0]),
+        number(row["final_distance"]["0.5"], 3),
+        number(row["final_distance"]["0.95"], 3),
+        number(row["final_speed"]["0.5"], 2),
+        number(row["final_spin"]["0.5"], 2),
+        number(row["settling_time"]["0.5"], 1),
+    ]
 
 
 SAMPLED = ("reach", "reach-and-stay", "decrease", "contraction", "basin", "quantiles")
@@ -263,7 +309,8 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
     out = args.out
     if args.run in CONTROLLERS:
         if game is None or out is None:
-            raise UserError(f"certify: {args.run} needs --task TASK and --out DIRECTORY.")
+            missing = "--task TASK" if game is None else "--out DIRECTORY"
+            raise UserError(f"certify: {args.run} is a controller, not a run; add {missing}.")
         controller: Any = CONTROLLERS[args.run](game)
     else:
         run = Run.open(expand([Path(args.run)])[0], game, algorithm)
@@ -271,8 +318,9 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
         out = out or run.directory / "certificate"
     if out.exists() and not args.force:
         raise UserError(f"out: {out} already exists; choose another or add --force.")
+    usual = (*SAMPLED, "linearisation", *(("safe",) if has_rules(game) else ()))
     chosen = {}
-    for name in args.certificates or (*SAMPLED, "linearisation"):
+    for name in args.certificates or usual:
         if name not in CERTIFICATES:
             hint = config.suggest(name, CERTIFICATES)
             raise UserError(f"certificates: there is none called '{name}'; {hint}")
@@ -281,27 +329,57 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
         chosen[name] = dataclasses.replace(c, rollouts=args.rollouts) if several else c  # pyright: ignore
     V = cost_sum(game, controller, stream(args.seed, "calibrate"))
     if V.ball > game.radius:
-        say(f"V counts what lies beyond {V.ball:g} m: so far this strays from the target itself.")
+        say(
+            f"V ignores errors below {V.ball:g} m: started on the target, this controller drifts "
+            "that far."
+        )
+    tell = say if args.json else print
 
-    def tell(verdict: Verdict) -> None:
-        mark = "holds" if verdict.holds else "does not hold"
-        (say if args.json else print)(f"[{verdict.evidence}] {verdict.claim}: {mark}.")
+    def begin(name: str) -> None:
+        if sys.stderr.isatty():  # each takes some seconds
+            say(f"{name} ...")
 
-    result = certify(game, controller, chosen, args.seed, args.confidence, V=V, tell=tell)
+    result = certify(
+        game,
+        controller,
+        chosen,
+        args.seed,
+        args.confidence,
+        V=V,
+        optional=() if args.certificates else usual,
+        begin=begin,
+        tell=lambda verdict: tell(f"[{verdict.evidence}] {sentence(verdict)}"),
+    )
+    for name, why in result["left_out"].items():
+        tell(f"[left out] {name}: {why.removeprefix(f'{name}: ')}")
+    tell(f"Information: {result['information']}.")
     save(out, result, game, controller, V, replace=args.force)
     say(f"Certificate: {out}")
     return result | {"certificate": str(out)}, 0
 
 
 def recheck_certificate(args: Namespace, overrides: Overrides) -> Result:
-    """`recheck`: reject the certificate or confirm its figures."""
-    tell = (lambda name: None) if args.json else (lambda name: print(f"{name}: agrees", flush=True))
+    """`recheck`: reject the certificate, or say of each verdict that it agrees.
+
+    The exit code is 0 only if every verdict was derived again, and 1 where some could not be.
+    """
+
+    def tell(name: str, verdict: dict[str, Any]) -> None:
+        if not args.json:
+            mark = "holds" if verdict["holds"] else "does not hold"
+            print(f"{name} agrees: {verdict['claim']}: {mark}.", flush=True)
+
     result = recheck(args.certificate, tell)
+    done, left = len(result["rechecked"]), result["not_rechecked"]
     if not args.json:
-        print(f"{args.certificate}: derived again, {len(result['rechecked'])} certificates agree.")
-        if result["not_rechecked"]:
-            print(f"Not looked at: {', '.join(result['not_rechecked'])}.")
-    return result, 0
+        for name, why in left.items():
+            print(f"NOT CHECKED: {name}: {why}.")
+        print(
+            f"{args.certificate}: {done} of {done + len(left)} verdicts were derived again; ",
+            end="",
+        )
+        print("the file as a whole is not confirmed." if left else "all agree.")
+    return result, int(not result["agrees"])
 
 
 def check_task(args: Namespace, overrides: Overrides) -> Result:
@@ -335,10 +413,14 @@ def check_task(args: Namespace, overrides: Overrides) -> Result:
 
 def report(args: Namespace, overrides: Overrides) -> Result:
     """Write the HTML page and the pictures."""
-    game, algorithm = own_code(args, overrides)
-    runs = [Run.open(d, game, algorithm) for d in expand(args.runs)]
-    out = args.out or runs[0].directory / "report.html"
-    page = film.page(runs, args.episodes, args.seed, command=shlex.join(["marlyap", *sys.argv[1:]]))
+    opened = [subject(d, args.task, args.algorithm, overrides) for d in expand(args.runs)]
+    runs = [run for run, _ in opened]
+    default = runs[0].directory / "report.html" if len(runs) == 1 else Path("report.html")
+    out = args.out or default
+    if out.exists() and not is_report(out):
+        raise UserError(f"out: {out} exists and is not a report of marlyap; choose another file.")
+    command = shlex.join(["marlyap", *sys.argv[1:]])
+    page = film.page(opened, args.episodes, starts_of(args.seed), command, args.task or "")
     store.write_text_atomic(out, html(cast(Page, page)))
     from marlyap import draw
 
@@ -346,27 +428,44 @@ def report(args: Namespace, overrides: Overrides) -> Result:
     draw.trajectories_png(page["films"], pictures[0])
     draw.learning_curves_png(page["runs"], pictures[1])
     say(f"Report: {out.resolve()}")
-    summary = {k: page["summary"][k] for k in ("episodes", "successes", "success_rate", "interval")}
-    return summary | {"report": str(out), "pictures": [str(p) for p in pictures]}, 0
+    for note in page["notes"]:
+        say(note)
+    result = {"start_seed": page["starts"], "groups": page["groups"]}
+    if len(page["groups"]) == 1:
+        result = {k: v for k, v in page["groups"][0].items() if k != "text"} | result
+    return result | {"report": str(out), "pictures": [str(p) for p in pictures]}, 0
+
+
+def is_report(path: Path) -> bool:
+    """Whether a file was written by `report`, and may be replaced by it."""
+    try:
+        with path.open("rb") as file:
+            return MARK.encode() in file.read(10_000_000)
+    except OSError as error:
+        raise UserError(f"out: {path} cannot be read ({error.strerror}).") from None
 
 
 def watch(args: Namespace, overrides: Overrides) -> Result:
     """Film one episode."""
-    game, algorithm = own_code(args, overrides)
-    run = Run.open(expand([args.run])[0], game, algorithm)
+    run, game = subject(expand([args.run])[0], args.task, args.algorithm, overrides)
     place = args.out or run.directory
     if not place.is_dir():
         raise UserError(f"out: there is no directory {place}.")
-    shot = film.one(run, args.episode, args.seed)
+    starts = starts_of(args.seed)
+    shot = film.one(run, args.episode, starts, game=game)
     from marlyap import draw
 
     gif, page = place / "film.gif", place / "film.html"
     draw.film_gif(cast(Film, shot), gif)
-    store.write_text_atomic(
-        page, html(cast(Page, {"title": f"One episode of {run.title}", "films": [shot]}))
-    )
+    title = f"One episode of {run.title}"
+    about = f"start {args.episode} of the held-out starts of seed {starts}"
+    if game is not run.game:
+        about += f", on {groups.told(run.game, game, args.task or '')}"
+    text = html(cast(Page, {"title": title, "subtitle": about, "films": [shot]}))
+    store.write_text_atomic(page, text)
     say(f"Film: {page.resolve()} and {gif.resolve()}")
-    return {"gif": str(gif), "html": str(page), "success": bool(shot["success"])}, 0
+    done = {"gif": str(gif), "html": str(page), "start_seed": starts}
+    return done | {"success": bool(shot["success"])}, 0
 
 
 def listing(args: Namespace, overrides: Overrides) -> Result:
@@ -503,10 +602,9 @@ def demo(args: Namespace, overrides: Overrides) -> Result:
         Namespace(runs=names, out=out, episodes=500, seed=0, task=None, algorithm=None), {}
     )
     assert result is not None
-    low, high = (100 * end for end in result["interval"])
-    rate, seconds = 100 * result["success_rate"], time.monotonic() - start
-    text = f"{result['successes']} of {result['episodes']} fresh starts succeeded: {rate:.1f} % "
-    text += f"(95 % interval {low:.1f} to {high:.1f} %), in {seconds:.0f} s."
+    rests = f"; the team {result['rests']}" if result["rests"] else ""
+    text = f"{result['successes']} of {result['episodes']} held-out starts of seed 0 succeeded: "
+    text += f"{groups.words(result)}{rests}. It took {time.monotonic() - start:.0f} s."
     print(text, file=sys.stderr if args.json else sys.stdout)
     return result | {"seconds": time.monotonic() - start}, 0
 

@@ -1,7 +1,7 @@
 """Does a task keep the laws that training, evaluation and the certificates rely on?
 
-`conformance` plays a few episodes with random actions, disturbs what it saw, and holds every law of
-`LAWS` against it: more than the checks of PettingZoo ask, which look at one step and accept NaN.
+`conformance` plays a few episodes with random actions, perturbs the states that occurred, and tests
+every law of `LAWS` on them. PettingZoo's checks, by comparison, look at one step and accept NaN.
 """
 
 import dataclasses
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from marlyap.controllers import UniformlyRandom
 from marlyap.errors import first_line, raised_at
 from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import at_target
@@ -22,28 +23,34 @@ from marlyap.rollout import rollout
 from marlyap.types import Action, Key, Keys, State, Trajectory
 
 
-EPISODES, ROWS = 8, 64  # played, and looked at in one call
+EPISODES, ROWS = 32, 64  # episodes played, and states examined in one call
 ENDS = [0, ROWS - 1]
 SOME = 16  # agents that are moved one by one, when there are more
 NUDGES = (1e-3, 0.3)  # by which they are moved (m)
-HALVINGS, STEEPER = 10, 8.0  # a slope that grows this much while a pair closes in is a jump
+HALVINGS, LAST = 12, 3  # of the gap between two states, and those over which slopes are compared
+STEEPER = 1.5  # a slope that still grows this much in the last halvings has no bound
+LOOKAHEAD = 20  # steps that an early ending is held against: 1 / (1 - gamma) for gamma = 0.95
 
-Faults = Iterator[str]  # one sentence each: the method, what is wrong, the mend
+Faults = Iterator[str]  # one sentence each: the method, what is wrong, the remedy
 
 
 class Finding(NamedTuple):
-    """What was found of one law."""
+    """The result for one law."""
 
     law: str
     says: str
-    faults: tuple[str, ...] | None  # None: it could not be looked at
+    faults: tuple[str, ...] | None  # None: it could not be tested
     figures: dict[str, float]
 
 
 def conformance(
     game: AbstractGame, seed: int = 0, laws: "Sequence[Callable[[Probe], Faults]] | None" = None
 ) -> list[Finding]:
-    """One finding for each law (default: all). An exception that the task raises is a fault too."""
+    """Test a game against `laws` (default: all of `LAWS`), after `shapes`.
+
+    Returns one finding for each law, `shapes` first. An exception that the task raises is a fault
+    too; where shapes are wrong, no other law is tested.
+    """
     laws = LAWS if laws is None else laws
     faults = tuple(_caught(lambda: shapes(game)))
     try:
@@ -73,21 +80,22 @@ def _caught(law: Callable[[], Faults]) -> Faults:
 
 def _raised(method: str, error: Exception) -> str:
     traced = isinstance(error, (jax.errors.JAXTypeError, jax.errors.JAXIndexError))
-    mend = "use jnp.where, not if or float()" if traced else "let it return for every state"
+    remedy = "use jnp.where, not if or float()" if traced else "make it return for every state"
     place = f" at {place}" if (place := raised_at(error)) else ""
-    return f"{method}: it raised {first_line(error)}{place}; {mend}."
+    return f"{method}: it raised {first_line(error)}{place}; {remedy}."
 
 
-# --- What is looked at ---------------------------------------------------------------------------
+# --- What is examined -----------------------------------------------------------------------------
 
 
-METHODS = {"obs": "observe", "next": "step"}  # the others are called as their key
+METHODS = {"obs": "observe", "unlinked": "observe", "next": "step"}  # others: as their key
 
 
 def see(game: AbstractGame, state: State, action: Action) -> dict[str, Any]:
-    """Everything a game says of one state and action."""
+    """Everything a game says of one state and action; `unlinked` is `observe` without links."""
     return {
         "obs": game.observations(state),
+        "unlinked": game.observe(state, jnp.zeros((game.agents, game.agents), bool)),
         "features": game.features(state),
         "errors": game.errors(state),
         "costs": game.costs(state, action),
@@ -108,9 +116,7 @@ def _play(game: AbstractGame, keys: Keys) -> Trajectory:
 
     def one(key: Key) -> Trajectory:
         k_start, k_act = jax.random.split(key)
-        size = (game.agents, game.dynamics.du)
-        at_random = lambda _, key: jax.random.uniform(key, size, minval=-1.0)
-        return rollout(game, at_random, game.reset(k_start), k_act)
+        return rollout(game, UniformlyRandom(game), game.reset(k_start), k_act)
 
     return jax.vmap(one)(keys)
 
@@ -121,16 +127,21 @@ def _rest(game: AbstractGame, states: State) -> State:
 
 
 class Probe:
-    """What was seen of a game: `states` and `actions` of ROWS moments, and what it says of them."""
+    """What a game said: `states` and `actions` of ROWS moments, and `seen`, what it says of them.
+
+    `played` are whole episodes, `starts` their first states. States are kept in NumPy, random keys
+    in them as keys, so that they can be given to the game again.
+    """
 
     def __init__(self, game: AbstractGame, seed: int = 0):
         self.game, self.traces, self.figures = game, 0, {}
         self.keys = jax.random.split(jax.random.key(seed), EPISODES)
-        self.played = plain(_play(game, self.keys))
-        running = ~np.concatenate([np.zeros((EPISODES, 1), bool), self.played.terminated], 1)
-        episode, time = np.nonzero(running[:, :-1])
+        self.played = kept(_play(game, self.keys))
+        over = np.concatenate([np.zeros((EPISODES, 1), bool), self.played.terminated], 1)
+        self.running = ~over[:, :-1]  # the episodes that had not ended before a step
+        episode, time = np.nonzero(self.running)
         pick = np.linspace(0, len(time) - 1, ROWS).astype(int)
-        at = lambda leaf: np.asarray(leaf)[episode[pick], time[pick]]
+        at = lambda leaf: leaf[episode[pick], time[pick]]
         self.states = jax.tree.map(at, self.played.state)
         self.actions = at(self.played.action)
         self.starts = jax.tree.map(lambda leaf: leaf[:, 0], self.played.state)
@@ -149,7 +160,7 @@ class Probe:
     def target(self, states: State | None = None) -> State:
         """The same scenes with every agent at rest where it has to be."""
         arrays = jax.tree.map(jnp.asarray, states or self.states)
-        return plain(_rest(self.game, arrays))
+        return kept(_rest(self.game, arrays))
 
     def fresh(self) -> State:
         """The first start, uncompiled."""
@@ -172,9 +183,20 @@ class Probe:
             return plain(look(*rows((self.states, self.actions), ENDS)))
 
 
+def is_key(leaf: Any) -> bool:
+    """Whether it is an array of typed random keys, which NumPy cannot hold."""
+    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def kept(tree: Any) -> Any:
+    """The same tree in NumPy, random keys left as they are."""
+    return jax.tree.map(lambda leaf: leaf if is_key(leaf) else np.asarray(leaf), tree)
+
+
 def plain(tree: Any) -> Any:
-    """The same tree in NumPy."""
-    return jax.tree.map(np.asarray, tree)
+    """The same tree in NumPy, random keys as their bits."""
+    bits = lambda leaf: jax.random.key_data(leaf) if is_key(leaf) else leaf
+    return jax.tree.map(lambda leaf: np.asarray(bits(leaf)), tree)
 
 
 def nudged(states: State, agent: Any, by: float, coordinate: Any = slice(None), what: str = "x"):
@@ -186,14 +208,16 @@ def nudged(states: State, agent: Any, by: float, coordinate: Any = slice(None), 
 
 def rows(batch: Any, which: int | list[int]) -> Any:
     """One row of a batch, or several in this order."""
-    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[which]), batch)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf[np.asarray(which)]), batch)
 
 
-def influence(probe: Probe, row: int, by: float, what: str = "x") -> dict[int, Any]:
+def influence(
+    probe: Probe, row: int, by: float, what: str = "x", view: str = "obs"
+) -> dict[int, Any]:
     """Whose observation changes when one agent is moved, from the state `row`.
 
     For every agent j that was moved without a change of links: for each agent i whether row i of
-    the observations changed, to the last bit.
+    the observations changed, to the last bit. With `view` "unlinked", of those without links.
     """
     game, found = probe.game, {}
     base, actions = rows(probe.states, [row] * ROWS), rows(probe.actions, [row] * ROWS)
@@ -203,7 +227,7 @@ def influence(probe: Probe, row: int, by: float, what: str = "x") -> dict[int, A
     after = probe.look(nudged(base, agents, by, what=what), actions)
     for k, j in enumerate(moved):
         if np.array_equal(before["linked"][k], after["linked"][k]):
-            found[int(j)] = np.any(before["obs"][k] != after["obs"][k], axis=1)
+            found[int(j)] = np.any(before[view][k] != after[view][k], axis=1)
     return found
 
 
@@ -212,15 +236,18 @@ def different(a: dict[str, Any], b: dict[str, Any], exact: bool = False) -> list
     close = lambda x, y: np.allclose(x, y, 1e-4 * (not exact), 1e-5 * (not exact), equal_nan=True)
     leaves = lambda value: [np.asarray(leaf) for leaf in jax.tree.leaves(value)]
     same = lambda x, y: all(map(close, leaves(x), leaves(y)))
-    return [METHODS.get(name, name) for name in a if not same(a[name], b[name])]
+    names = [METHODS.get(name, name) for name in a if not same(a[name], b[name])]
+    return list(dict.fromkeys(names))
 
 
 # --- The laws ------------------------------------------------------------------------------------
 
 
 def shapes(game: AbstractGame) -> Faults:
-    """Shapes and types are those of the game's spaces."""
+    """Fields have types, and arrays the shapes and types of the game's spaces."""
     n, d = game.agents, game.dynamics
+    yield from _untyped(game)
+    yield from _untyped(d)
     try:
         state = eqx.filter_eval_shape(game.reset, jax.random.key(0))
     except Exception as error:
@@ -265,13 +292,35 @@ def shapes(game: AbstractGame) -> Faults:
         yield _raised("step", error)
         return
     if jax.tree.structure(after) != jax.tree.structure(state):
-        yield "step: it returns another kind of state than reset; keep the parts that reset gives."
+        yield "step: its state has other parts than that of reset; return the same parts."
         return
     paths = jax.tree_util.tree_leaves_with_path(state)
     for (path, old), new in zip(paths, jax.tree.leaves(after), strict=True):
         if (old.shape, old.dtype) != (new.shape, new.dtype):
             name = jax.tree_util.keystr(path).lstrip(".")
             yield f"step: {name} becomes {_text(new)} from {_text(old)}; keep shape and type."
+
+
+def _untyped(thing: Any) -> Faults:
+    """Values in the body of a user's class that are no fields, for want of an annotation."""
+    notes = lambda cls: vars(cls).get("__annotations__", {})
+    classes = type(thing).__mro__
+    shared = {k for c in classes for k, kind in notes(c).items() if "ClassVar" in str(kind)}
+    for cls in classes:
+        if cls.__module__.startswith("marlyap."):
+            continue
+        for name, value in vars(cls).items():
+            method = callable(value) or hasattr(value, "__get__")
+            if name.startswith("_") or method or name in shared or name in notes(cls):
+                continue
+            text = repr(value) if len(repr(value)) <= 40 else "..."
+            kind = type(value).__name__
+            if isinstance(value, tuple):
+                kind = f"tuple[{type(value[0]).__name__ if value else 'int'}, ...]"
+            yield (
+                f"fields: {name} = {text} needs a type, as in {name}: {kind} = {text}; without one "
+                "it is not a field of the task."
+            )
 
 
 def _unlike(name: str, found: Any, shape: tuple[int | None, ...], kind: str) -> Faults:
@@ -292,11 +341,11 @@ def _unlike(name: str, found: Any, shape: tuple[int | None, ...], kind: str) -> 
 
 
 def _text(x: Any) -> str:
-    return f"{np.dtype(x.dtype)}[{', '.join(map(str, x.shape))}]"
+    return f"{x.dtype}[{', '.join(map(str, x.shape))}]"
 
 
 def finite(probe: Probe) -> Faults:
-    """Every number is finite, in every state that was met."""
+    """Every number is finite in every state that occurred."""
     for name, value in probe.seen.items():
         for leaf in jax.tree.leaves(value):
             bad = ~np.isfinite(leaf).reshape(ROWS, -1).all(axis=1)
@@ -310,52 +359,52 @@ def finite(probe: Probe) -> Faults:
 
 
 def deterministic(probe: Probe) -> Faults:
-    """The same key gives the same episode, to its last step and bit."""
+    """The same key gives the same episode, bit for bit."""
     again = plain(_play(probe.game, probe.keys))
-    pairs = zip(jax.tree.leaves(probe.played), jax.tree.leaves(again), strict=True)
+    pairs = zip(jax.tree.leaves(plain(probe.played)), jax.tree.leaves(again), strict=True)
     if not all(np.array_equal(a, b, equal_nan=True) for a, b in pairs):
-        yield "step: the same key gave two different episodes; take all chance from the key."
+        yield "step: the same key gave two different episodes; draw everything from the key."
     if different({"reset": probe.fresh()}, {"reset": probe.fresh()}, exact=True):
-        yield "reset: the same key gave two different starts; take all chance from the key."
+        yield "reset: the same key gave two different starts; draw everything from the key."
     for name in different(probe.alone[0], probe.alone[-1], exact=True):
-        yield f"{name}: it said two things of one state; use no chance but the key of reset."
+        yield f"{name}: two calls with one state differ; take random keys from the state."
 
 
 def compiled(probe: Probe) -> Faults:
-    """Compiled, it says what it says line by line."""
+    """jit agrees with eager execution."""
     fast, slow = probe.seen, probe.together
     for name in different(jax.tree.map(lambda leaf: leaf[[0, -1]], fast), slow):
-        yield f"{name}: compiled and uncompiled it differs; do not ask what is being traced."
+        yield f"{name}: under jit it differs; make it independent of tracing."
 
 
 def batched(probe: Probe) -> Faults:
-    """Many at once, it says what it says one by one."""
+    """vmap agrees with a loop."""
     loop = jax.tree.map(lambda *leaves: np.stack(leaves), *probe.alone[:2])
     for name in different(loop, probe.together):
-        yield f"{name}: under jax.vmap it differs; write it for one state, without own rules."
+        yield f"{name}: under vmap it differs; write it for one state, without batching rules."
 
 
 def traced_once(probe: Probe) -> Faults:
-    """An equal task, built anew, is not compiled again."""
+    """An equal task, built anew, reuses the compiled code."""
     game = probe.game
     try:
         twin = dataclasses.replace(game, dynamics=dataclasses.replace(game.dynamics))
     except Exception as error:
-        yield f"fields: they do not make it anew ({error}); let them be what its constructor takes."
+        yield f"fields: the constructor does not take them ({error}); leave __init__ to the fields."
         return
     before = probe.traces
     probe.look(probe.states, -probe.actions, game=twin)
     if probe.traces > before:
-        yield "fields: an equal task is compiled again; keep functions and objects out of them."
+        yield "fields: an equal task is compiled again; use numbers, text, tuples, modules."
 
 
 def resets(probe: Probe) -> Faults:
-    """Episodes start at step 0, differ, and owe nothing to those before."""
+    """Episodes start at step 0, differ, and do not depend on earlier ones."""
     x = np.concatenate([probe.starts.x, probe.starts.goal], axis=2).reshape(EPISODES, -1)
     if len(np.unique(x, axis=0)) < EPISODES:
         yield "reset: different keys gave the same start; draw it from the key."
     if np.any(probe.starts.t):
-        yield f"reset: an episode starts at t = {int(probe.starts.t.max())}; let t be 0."
+        yield f"reset: an episode starts at t = {int(probe.starts.t.max())}; start at 0."
     before = probe.fresh()
     with jax.disable_jit():
         probe.game.step(*rows((probe.states, probe.actions), 0))
@@ -364,7 +413,7 @@ def resets(probe: Probe) -> Faults:
 
 
 def clock(probe: Probe) -> Faults:
-    """A step counts one and leaves the goal where it is."""
+    """A step adds 1 to t and leaves the goal where it is."""
     if np.any(probe.seen["next"].t != probe.states.t + 1):
         yield "step: t does not grow by 1; return t=state.t + 1."
     if not np.array_equal(probe.seen["next"].goal, probe.states.goal):
@@ -372,7 +421,7 @@ def clock(probe: Probe) -> Faults:
 
 
 def local(probe: Probe) -> Faults:
-    """Row i of the observations comes from agent i and its neighbours alone."""
+    """Row i of the observations depends on agent i and its neighbours only."""
     leads, everyone, told = probe.game.leads, np.arange(probe.game.agents), set()
     for row in ENDS:
         linked = probe.seen["linked"][row]
@@ -383,13 +432,28 @@ def local(probe: Probe) -> Faults:
             for j, changed in influence(probe, row, by, what="goal").items():
                 near = linked[:, j] | (everyone == j)
                 if np.any(changed & ~(near & leads[j])):
-                    told.add(f"the goal of agent {j}, which is not theirs to see")
+                    told.add(f"the goal of agent {j}, which it must not know")
     for what in sorted(told)[:1]:
         yield f"observe: a row changes with {what}; use local_view, slots and leads."
 
 
+def links(probe: Probe) -> Faults:
+    """observe takes neighbours from its argument links."""
+    everyone = np.arange(probe.game.agents)
+    for by in NUDGES:
+        for what in ("x", "goal"):
+            found = influence(probe, ENDS[0], by, what=what, view="unlinked").items()
+            for j, changed in found:
+                if np.any(changed & (everyone != j)):
+                    yield (
+                        f"observe: without links a row still changes with agent {j}; take "
+                        "neighbours from the argument links, not from self.linked."
+                    )
+                    return
+
+
 def bounded_inputs(probe: Probe) -> Faults:
-    """Actions beyond [-1, 1] do what those at its ends do."""
+    """Actions are clipped to [-1, 1]."""
     far = 4.0 * probe.actions
     wide, held = (probe.look(probe.states, a)["next"] for a in (far, np.clip(far, -1.0, 1.0)))
     if different({"step": wide}, {"step": held}):
@@ -397,27 +461,42 @@ def bounded_inputs(probe: Probe) -> Faults:
 
 
 def target(probe: Probe) -> Faults:
-    """The target set is where the errors are zero, a success, and left by no agent at rest."""
+    """On the target set errors are zero, success holds and agents at rest stay."""
     there = probe.target()
     out = probe.look(there, 0 * probe.actions)
     small = 1e-5 * (1 + np.abs(probe.states.x).max())
     if not np.all(out["success"]):
-        yield "success: it is false with every agent on its goal; let it hold there."
+        yield "success: it is false with every agent on its goal; return true there."
     if np.all(probe.seen["success"]):
-        yield "success: it holds in every state that was met; ask for all agents near their goals."
+        yield "success: it holds in every state that occurred; ask for all agents near their goals."
     if np.abs(out["errors"]).max() > small:
         yield "errors: they are not 0 with every agent at rest on its goal; measure from the goal."
     moved = np.abs(out["next"].x - there.x).max()
     if moved > small:
-        yield f"step: without an action agents at rest move by {moved:.2g}; let them stay."
+        yield f"step: without an action agents at rest move by {moved:.2g}; make them stay."
     agents = np.resize(np.arange(probe.game.agents), ROWS)
     for coordinate in (0, 1):
         off = nudged(there, agents, 1e-2, coordinate)
         seen = probe.look(off, 0 * probe.actions)
         away = np.abs(seen["distance"] - out["distance"])[np.arange(ROWS), agents] > 1e-3
         if np.any(away & ~np.any(np.abs(seen["errors"]) > small, axis=(1, 2))):
-            yield "errors: they are 0 beside the goal too; let them be 0 on the target set alone."
+            yield "errors: they are 0 beside the goal too; make them 0 on the target set only."
             break
+
+
+def features(probe: Probe) -> Faults:
+    """Features begin with the errors, agent by agent."""
+    there = probe.look(probe.target(), 0 * probe.actions)
+    for out in (probe.seen, there):
+        errors, seen = out["errors"], out["features"]
+        begin = seen[:, :, : errors.shape[2]]
+        size = 1e-5 * (1 + np.abs(errors).max())
+        if begin.shape != errors.shape or not np.allclose(begin, errors, 1e-4, size):
+            yield (
+                "features: they do not begin with the errors; return jnp.concatenate([self.errors("
+                "state), ...], axis=1), since V is zero where the first features are."
+            )
+            return
 
 
 def costs(probe: Probe) -> Faults:
@@ -426,20 +505,20 @@ def costs(probe: Probe) -> Faults:
     there = probe.look(probe.target(), 0 * probe.actions)["costs"]
     probe.figures |= {"largest": float(cost.max()), "on target": float(np.abs(there).max())}
     if cost.min() < 0 or there.min() < 0:
-        yield f"costs: one is {min(cost.min(), there.min()):.3g}; let none be negative."
+        yield f"costs: one is {min(cost.min(), there.min()):.3g}; make every cost >= 0."
     if np.abs(there).max() > 1e-5 * max(1.0, float(np.median(cost))):
-        yield f"costs: they are {np.abs(there).max():.3g} on the target set; let them be 0 there."
+        yield f"costs: they are {np.abs(there).max():.3g} on the target set; make them 0 there."
     if not np.any(cost):
-        yield "costs: they are 0 wherever the agents went; let them grow with the distance."
+        yield "costs: they are 0 in every state that occurred; make them grow with the distance."
     if not np.allclose(probe.seen["cost"], cost.mean(axis=1), 1e-4, 1e-5):
-        yield "cost: it is not the mean of costs; replace costs, and leave cost as it is."
+        yield "cost: it is not the mean of costs; override costs, not cost."
 
 
 def rewards(probe: Probe) -> Faults:
-    """The reward says what the cost says: it falls where the cost rises."""
+    """Rewards fall where costs rise."""
     reward, cost = (probe.seen[k].mean(axis=1).astype(float) for k in ("rewards", "costs"))
     if np.ptp(reward) == 0:
-        yield "rewards: they are the same in every state that was met; let them fall with the cost."
+        yield "rewards: they are the same in all states that occurred; make them fall with costs."
         return
     together = float(np.corrcoef(reward, cost)[0, 1]) if np.ptp(cost) else 0.0
     probe.figures["correlation"] = together
@@ -447,76 +526,121 @@ def rewards(probe: Probe) -> Faults:
         yield "rewards: they rise with the cost; return its negative."
 
 
-def smooth_cost(probe: Probe) -> Faults:
-    """The cost is Lipschitz in states and actions (Assumption 1)."""
-    first, last = _steepest(probe, lambda out: out["cost"][:, None])
-    probe.figures["slope"] = last
-    if not last <= STEEPER * max(first, 1e-3):
+def violations(probe: Probe) -> Faults:
+    """No agent breaks the rules in every state."""
+    broken = probe.seen["violations"]
+    probe.figures["share of states"] = float(broken.any(axis=1).mean())
+    for i in np.flatnonzero(broken.all(axis=0))[:1]:
         yield (
-            f"costs: between ever closer states the slope grows from {first:.2g} to {last:.2g}, as "
-            "at a jump or a root; make them Lipschitz (Assumption 1)."
+            f"violations: agent {i} breaks a rule in every state that occurred; return true only "
+            "where a rule is broken."
+        )
+
+
+def smooth_cost(probe: Probe) -> Faults:
+    """Costs are Lipschitz in states and actions (Assumption 1)."""
+    before, last = _steepest(probe, lambda out: out["cost"][:, None])
+    probe.figures["slope"] = last
+    if not last <= STEEPER * max(before, 1e-3):
+        yield (
+            f"costs: between ever closer states the slope grows from {before:.2g} to {last:.2g}, "
+            "as at a jump or a root; make them Lipschitz (Assumption 1)."
         )
 
 
 def smooth_step(probe: Probe) -> Faults:
     """The dynamics are Lipschitz in states and actions (Assumption 2)."""
-    first, last = _steepest(probe, lambda out: out["next"].x.reshape(ROWS, -1))
+    before, last = _steepest(probe, lambda out: out["next"].x.reshape(ROWS, -1))
     probe.figures["slope"] = last
-    if not last <= STEEPER * max(first, 1e-3):
+    if not last <= STEEPER * max(before, 1e-3):
         yield (
-            f"step: between ever closer states the slope grows from {first:.2g} to {last:.2g}, as "
+            f"step: between ever closer states the slope grows from {before:.2g} to {last:.2g}, as "
             "at a jump; make it Lipschitz (Assumption 2) and leave angles unwrapped."
         )
 
 
 def _steepest(probe: Probe, f: Callable[[dict[str, Any]], Any]) -> tuple[float, float]:
-    """The largest slope of f between far pairs, and after closing in on the steeper half of each.
+    """The largest slope of f between two states: LAST halvings of their gap ago, and at the end.
 
-    A half is at least as steep as the whole, so that the second is the larger; of a Lipschitz
-    function both are at most its constant, and at a jump each halving doubles the slope. Half of
-    the pairs are states of different episodes, the others end on the target set.
+    Of each pair the line between is cut into four, and the steepest quarter with half a quarter on
+    both sides is cut again, so slopes do not fall. Those of a Lipschitz function, however steep,
+    level off at its constant: a penalty such as 10 max(0, 0.25 - gap) at 10. A jump doubles the
+    slope in every halving, a square root multiplies it by sqrt 2, even a cusp: the margins keep it
+    in sight. Half of the pairs are states of different episodes, the others end on the target set.
     """
-    scene = lambda x: eqx.tree_at(lambda s: s.x, probe.states, x)
-    half = np.arange(ROWS) < ROWS // 2
+    half, each = np.arange(ROWS) < ROWS // 2, np.arange(ROWS)
     pick = lambda a, b: np.where(half[:, None, None], a, b)
-    low = (probe.states.x, probe.actions)
-    other = np.roll(np.arange(ROWS), ROWS // 2 - 1)
-    high = (
+    other = np.roll(each, ROWS // 2 - 1)
+    near = (probe.states.x, probe.actions)
+    far = (
         pick(probe.states.x[other], probe.target().x),
         pick(probe.actions[other], 0 * probe.actions),
     )
-    value = lambda end: f(probe.look(scene(end[0]), end[1])).astype(float)
     size = lambda a: np.sqrt(np.sum(np.square(a.reshape(ROWS, -1).astype(float)), axis=1))
-    apart = lambda a, b: np.hypot(size(a[0] - b[0]), size(a[1] - b[1]))
-    f_low, f_high, slopes = value(low), value(high), []
+
+    def at(share: Any) -> tuple[Any, Any, Any]:
+        """State, action and f at this share of the way from the near ends to the far ones."""
+        weight = share[:, None, None]
+        x, action = ((a + weight * (b - a)).astype(a.dtype) for a, b in zip(near, far, strict=True))
+        states = eqx.tree_at(lambda s: s.x, probe.states, x)
+        return x, action, f(probe.look(states, action)).astype(float)
+
+    begin, quarter, slopes = np.zeros(ROWS), 0.25, []
     for _ in range(HALVINGS + 1):
-        gap = apart(low, high)
-        slope = np.where(gap > 1e-6, size(f_high - f_low) / np.maximum(gap, 1e-6), 0.0)
-        slopes.append(float(slope.max()))
-        middle = tuple((a + b) / 2 for a, b in zip(low, high, strict=True))
-        f_middle = value(middle)
-        left = size(f_middle - f_low) > size(f_high - f_middle)
-        keep = lambda a, b, left=left: np.where(left.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-        low = tuple(keep(a, m) for a, m in zip(low, middle, strict=True))
-        high = tuple(keep(m, b) for m, b in zip(middle, high, strict=True))
-        f_low, f_high = keep(f_low, f_middle), keep(f_middle, f_high)
-    return slopes[0], slopes[-1]
+        points = [at(begin + k * quarter) for k in range(5)]
+        rises = []
+        for (x, a, y), (x_next, a_next, y_next) in zip(points, points[1:], strict=False):
+            gap = np.hypot(size(x_next - x), size(a_next - a))
+            rises.append(np.where(gap > 1e-6, size(y_next - y) / np.maximum(gap, 1e-6), 0.0))
+        slopes.append(float(np.max(rises)))
+        steepest = begin + np.argmax(rises, axis=0) * quarter
+        begin = np.clip(steepest - quarter / 2, 0.0, 1 - 2 * quarter)
+        quarter /= 2
+    return slopes[-1 - LAST], slopes[-1]
 
 
 def time_limit(probe: Probe) -> Faults:
-    """The time limit only truncates: it ends no game, and the world goes on after it."""
+    """The time limit truncates; it neither terminates nor stops the dynamics."""
     if np.all(probe.played.terminated[:, 0]):
-        yield "terminated: every game is over after one step; let it be true where the game ends."
+        yield "terminated: every episode ends after one step; return true only where the game ends."
     late = eqx.tree_at(lambda s: s.t, probe.states, probe.states.t + probe.game.horizon)
     out = probe.look(late, probe.actions)
     if not np.array_equal(out["terminated"], probe.seen["terminated"]):
         yield (
-            "terminated: it is true because the time is over; leave time out of it, for horizon "
+            "terminated: it depends on the time limit; leave time out of it, since the horizon "
             "truncates by itself."
         )
     moves = lambda after, before: np.any(after.x != before.x, axis=(1, 2))
     if np.any(moves(probe.seen["next"], probe.states) & ~moves(out["next"], late)):
-        yield "step: nothing moves after the horizon; let the world go on."
+        yield "step: nothing moves after the horizon; keep the dynamics independent of time."
+
+
+def termination(probe: Probe) -> Faults:
+    """An episode that ends without success does not spare the team its remaining costs."""
+    played, last = probe.played, probe.running & probe.played.terminated
+    episode, time = np.nonzero(last)
+    after = jax.tree.map(lambda leaf: leaf[episode, time + 1], played.state)
+    if len(episode):
+        which = np.resize(np.arange(len(episode)), ROWS).tolist()
+        seen = probe.look(rows(after, which), probe.actions)
+        failed = ~seen["success"][: len(episode)] & (time + 1 < probe.game.horizon)
+        episode, time = episode[failed], time[failed]
+    probe.figures["ended without success"] = float(len(episode))
+    if not len(episode):
+        return
+    reward = played.reward.mean(axis=2)
+    others = probe.running & ~last
+    usual = float(reward[others if others.any() else last].mean())
+    left = np.minimum(probe.game.horizon - 1 - time, LOOKAHEAD)
+    ending, going_on = reward[episode, time].mean(), usual * (1 + left.mean())
+    probe.figures |= {"reward at the end": float(ending), "reward of going on": float(going_on)}
+    # Half of it is charge enough: a learnt policy has smaller costs ahead than random actions.
+    if going_on < 0 and ending > going_on / 2:
+        yield (
+            f"terminated: an episode that ends without success at step {time.min() + 1} stops its "
+            "costs, so that ending early pays; count such states in `violations`, or charge the "
+            "remaining costs at once in `rewards`."
+        )
 
 
 LAWS: tuple[Callable[[Probe], Faults], ...] = (
@@ -528,11 +652,15 @@ LAWS: tuple[Callable[[Probe], Faults], ...] = (
     resets,
     clock,
     local,
+    links,
     bounded_inputs,
     target,
+    features,
     costs,
     rewards,
+    violations,
     smooth_cost,
     smooth_step,
     time_limit,
+    termination,
 )

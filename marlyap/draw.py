@@ -29,6 +29,7 @@ from marlyap.report import (
     scenes,
     ticks,
 )
+from marlyap.store import write_bytes_atomic
 
 
 PAPER, INK, SOFT, RULE, FAINT = "#ffffff", "#1c1d20", "#5e6169", "#dddcd6", "#ecebe6"
@@ -54,22 +55,23 @@ def trajectories_png(films: Sequence[Film], path: str | Path) -> None:
 
 
 def learning_curves_png(runs: Sequence[Run], path: str | Path) -> None:
-    """Success and return against environment steps: a line per run, and each algorithm's mean."""
-    figure = _figure(8.4, 3.2)
+    """Success and return against environment steps: a line per run, and each group's mean."""
+    figure = _figure(8.4, 3.4)
     success, gain = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2)
     _curves(success, runs, "success", "success (%)", 100)
     _curves(gain, runs, "return", "return of an episode", 1)
-    success.set_ylim(0, 100)
+    success.set_ylim(-3, 103)  # a curve at either end is seen whole
     if runs:
-        success.legend(frameon=False, fontsize=8, labelcolor=SOFT)
+        names = {"loc": "outside lower center", "ncols": 2, "frameon": False, "fontsize": 8}
+        figure.legend(*success.get_legend_handles_labels(), labelcolor=SOFT, **names)
     _save(figure, path)
 
 
 def _curves(axes: Any, runs: Sequence[Run], key: Key, name: str, scale: int) -> None:
-    groups = dict.fromkeys(run.get("algorithm") or "" for run in runs)
+    groups = dict.fromkeys(run.get("group") or "" for run in runs)
     for k, group in enumerate(groups):
         colour = PALETTE[k % len(PALETTE)]
-        own = [learning_curve(run, key) for run in runs if (run.get("algorithm") or "") == group]
+        own = [learning_curve(run, key) for run in runs if (run.get("group") or "") == group]
         for x, y in own:
             axes.plot(x, scale * y, color=colour, linewidth=0.9, alpha=0.6)
         x, y = mean_curve(own)
@@ -132,7 +134,7 @@ def _quiet(axes: Any) -> None:
 
 
 def _save(figure: Any, path: str | Path) -> None:
-    figure.savefig(path, format="png")
+    write_bytes_atomic(Path(path), lambda file: figure.savefig(file, format="png"))
 
 
 # -------------------------------------------------------------------------------------------------
@@ -172,15 +174,9 @@ def _write_gif(panes: Sequence[_Pane], path: str | Path, fps: float | int) -> No
     palette.putpalette([channel for colour in _inks() for channel in colour])
     small = [frame.quantize(palette=palette, dither=0) for frame in frames]
     pause = [round(1000 / fps)] * (len(small) - 1) + [1500]
-    small[0].save(
-        path,
-        format="GIF",
-        save_all=True,
-        append_images=small[1:],
-        duration=pause,
-        loop=0,
-        disposal=1,
-    )
+    options = {"duration": pause, "loop": 0, "disposal": 1, "append_images": small[1:]}
+    save = lambda file: small[0].save(file, format="GIF", save_all=True, **options)
+    write_bytes_atomic(Path(path), save)
 
 
 def _inks() -> list[tuple[int, int, int]]:
@@ -296,9 +292,8 @@ class _Pane:
         """L, else the cost, else the largest distance: up to now in ink, the rest in grey."""
         scene = self.scene
         values = scene.distance if scene.level is None else scene.level
-        name = {"L": "L along the episode", "": "largest distance (m)"}.get(
-            scene.level_name, scene.level_name
-        )
+        name = f"{scene.level_name} along the episode" if scene.rises else scene.level_name
+        name = name or "largest distance (m)"
         top, bottom = SHARP * (self.height - self.strip + 32), SHARP * (self.height - 4)
         pen.text((0, SHARP * (self.height - self.strip + 10)), name, SOFT, _font(13))
         most = float(np.nanmax(values)) if np.isfinite(values).any() else 0.0
@@ -308,7 +303,7 @@ class _Pane:
         for n in range(1, len(values)):
             if not np.isfinite(values[n - 1 : n + 1]).all():
                 continue
-            rises = scene.level_name == "L" and values[n] - values[n - 1] > 1e-3 * most
+            rises = scene.rises and values[n] - values[n - 1] > 1e-3 * most
             colour, width = (ALARM, 3) if rises else (INK, 1.8)
             pen.line(
                 (x[n - 1], y[n - 1], x[n], y[n]),

@@ -20,6 +20,7 @@ from marlyap.types import Key, Keys, Scalar, State, Trajectory
 RADII = (0.05, 0.1, 0.15, 0.2, 0.3)  # m, for the success curve
 HELD = 5  # steps over which `held` looks back
 REST = 0.1  # m/s and rad/s: an agent that moves and turns no faster is at rest
+RESTS = "comes to rest"  # said of a team that does
 BEYOND = 9  # horizons after the first over which an evaluation looks whether a team stays
 
 
@@ -130,9 +131,10 @@ class Evaluation(eqx.Module):
         if not self.successes.any():
             return ""
         if np.mean(moving[self.successes]) < 0.5:
-            return "comes to rest"
+            return RESTS
         speed, spin = np.median(self.speed[moving]), np.median(self.spin[moving])
         what = "circles inside the ball" if spin > REST else "keeps moving inside the ball"
+        what = "turns on the spot" if speed <= REST else what
         return f"{what} (median {speed:.2g} m/s, {spin:.2g} rad/s)"
 
 

@@ -24,6 +24,11 @@ class AbstractLyapunov(eqx.Module):
     ball: eqx.AbstractVar[float]  # rho (m)
 
     @property
+    def meaning(self) -> str:
+        """What V is, in words: "V, <meaning>" stands in the claims about it."""
+        return f"as {type(self).__name__} defines it"
+
+    @property
     @abc.abstractmethod
     def beyond(self) -> int:
         """How many steps past a state `along` has to see."""
@@ -54,6 +59,10 @@ class CostSum(AbstractLyapunov):
     ball: float = 0.0  # rho (m)
 
     @property
+    def meaning(self):
+        return f"the sum of the next {self.T} costs beyond {self.ball:g} m"
+
+    @property
     def beyond(self):
         return self.T
 
@@ -72,6 +81,10 @@ class Quadratic(AbstractLyapunov):
 
     P: Float[Array, "error error"]
     ball: float = 0.0
+
+    @property
+    def meaning(self):
+        return "a quadratic form in the errors"
 
     @property
     def beyond(self):
@@ -107,6 +120,10 @@ class Approach(AbstractLyapunov):
     ball: float = 0.0
 
     @property
+    def meaning(self):
+        return "the distances and headings to the goal and the gaps to the desired speeds"
+
+    @property
     def beyond(self):
         return 0
 
@@ -136,6 +153,10 @@ class Norm(AbstractLyapunov):
     ball: float = 0.0
 
     @property
+    def meaning(self):
+        return "a trained network that is zero on the target set"
+
+    @property
     def beyond(self):
         return 0
 
@@ -155,6 +176,10 @@ class ActionValue(AbstractLyapunov):
     net: LyapunovNet
     controller: Controller
     ball: float = 0.0
+
+    @property
+    def meaning(self):
+        return "the learnt L(s, mu(s))"
 
     @property
     def beyond(self):
@@ -194,7 +219,7 @@ def require_zero(game: AbstractGame, V: AbstractLyapunov, key: Array) -> None:
     worst, usual = float(jnp.max(jnp.abs(there))), float(jnp.median(jnp.abs(starts)))
     if not worst <= 1e-5 * max(usual, 1e-12):
         raise UserError(
-            f"V: {type(V).__name__} is {worst:.3g} on the target set, where it must be 0 (it is "
+            f"V, {V.meaning}, is {worst:.3g} on the target set, where it must be 0 (it is "
             f"{usual:.3g} at a usual start); take a V that is 0 there, or certificates "
             "that do not ask for one, such as reach."
         )
@@ -204,12 +229,13 @@ def cost_sum(game: AbstractGame, controller: Controller, key: Array) -> CostSum:
     """The T-step cost sum outside the smallest ball that the controller keeps from the target.
 
     Learnt policies keep moving a little there: what counts is leaving the ball. Its radius (m) is
-    that of the game, or two or four times that; for a controller that strays further the first.
+    that of the game, or two or four times that; for a controller that drifts further the first, and
+    `require_zero` refuses that V.
     """
     V = CostSum(controller=controller, ball=game.radius)
-    strays = float(_furthest(V, game, jax.random.split(key, 64)))
+    drift = float(_furthest(V, game, jax.random.split(key, 64)))
     balls = [game.radius * 2**k for k in range(3)]
-    return eqx.tree_at(lambda v: v.ball, V, next((b for b in balls if strays <= b), balls[0]))
+    return eqx.tree_at(lambda v: v.ball, V, next((b for b in balls if drift <= b), balls[0]))
 
 
 @eqx.filter_jit

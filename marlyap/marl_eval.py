@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from marlyap import store
+from marlyap import groups, store
 from marlyap.errors import UserError
 from marlyap.run import Run
 
@@ -41,6 +41,9 @@ def document(
         run = runs.setdefault(_run(row), {})
         run[f"step_{len(run)}"] = {"step_count": int(row["steps"])} | values(row)
     absolute = {_run(row): values(row) for row in final}
+    if len(absolute) < len(final):
+        twice = next(key for key in absolute if sum(_run(row) == key for row in final) > 1)
+        raise UserError(f"final: {twice[1]} seed {twice[2]} on {twice[0]} is there twice.")
     result: dict[str, Any] = {environment: {}}
     lengths: dict[str, int] = {}
     for (task, algorithm, seed), steps in runs.items():
@@ -59,16 +62,28 @@ def document(
 
 
 def from_runs(directories: Iterable[Path]) -> dict[str, Any]:
-    """The document for finished runs that `marlyap evaluate` has measured: success and return."""
-    curves, final = [], []
+    """The document for finished runs that `marlyap evaluate` has measured: success and return.
+
+    Runs count as seeds of one algorithm only if they differ in nothing else; different settings
+    of an algorithm are told apart in its name. Raises UserError where a run was not measured, or
+    not on the starts of the others.
+    """
+    opened, curves, final, starts = [], [], [], set()
     for directory in directories:
         run, measured = Run.open(directory), directory / "evaluation.json"
         if not measured.is_file():
             raise UserError(f"run: {directory} is not measured; run `marlyap evaluate` on it.")
-        about = {"task": run.names["task"], "algorithm": run.names["algorithm"], "seed": run.seed}
+        end = store.read_json(measured)
+        opened.append((run, end))
+        starts.add((end.get("start_seed", 0), end.get("episodes")))
+    if len(starts) > 1:
+        raise UserError("run: not all were measured on the same starts; evaluate them together.")
+    names = groups.named([groups.configured(run) for run, _ in opened])
+    for (run, end), name in zip(opened, names, strict=True):
+        task = run.labels["task"]
+        about = {"task": task, "algorithm": name.removeprefix(f"{task} "), "seed": run.seed}
         looks = [line for line in run.history() if "success" in line]
         curves += [about | {k: line[k] for k in ("steps", "success", "return")} for line in looks]
-        end = store.read_json(measured)
         final.append(about | {"success": end["success_rate"], "return": end["return_mean"]})
     return document(curves, final)
 

@@ -30,24 +30,12 @@ import numpy as np
 # -------------------------------------------------------------------------------------------------
 
 
-class Summary(TypedDict, total=False):
-    """The verdict: the large figure at the top."""
-
-    success_rate: float
-    interval: Sequence[float]  # exact 95 % interval, low and high
-    episodes: int
-    successes: int
-    seeds: int  # number of training seeds
-    radius: float  # m, of success
-    text: str  # one plain sentence: what is certified and what is not
-
-
 class Within(TypedDict, total=False):
     """Success at one radius."""
 
     radius: float  # m
     successes: int
-    rate: float
+    success_rate: float
     interval: Sequence[float]
 
 
@@ -56,21 +44,49 @@ class Within(TypedDict, total=False):
 LogRow = TypedDict("LogRow", {"steps": int, "success": float, "return": float}, total=False)
 
 
-class Run(TypedDict, total=False):
-    """One trained run (one seed) and its evaluation."""
+class Share(TypedDict, total=False):
+    """A share of the episodes."""
 
-    name: str
+    success_rate: float
+    interval: Sequence[float]
+
+
+class Figures(TypedDict, total=False):
+    """What an evaluation found, of one policy or over the training seeds of a group."""
+
     label: str
-    algorithm: str
-    seed: int
     episodes: int
     successes: int
     success_rate: float
-    interval: Sequence[float]
+    interval: Sequence[float]  # 95 %, low and high
+    radius: float  # m, of success
     radii: Sequence[Within]
+    at_rest: Share
+    stayed: Share
+    beyond_steps: int  # steps after the last over which `stayed` looks
+    violations: Share
     final_distance: Mapping[str, float]  # m, by quantile: "0.5", "0.95", "1.0"
+    final_speed: Mapping[str, float]  # m/s, of the fastest agent
+    final_spin: Mapping[str, float]  # rad/s
     settling_time: Mapping[str, float]  # s, by quantile
     return_mean: float  # of an episode
+    rests: str  # what a team does once it has arrived, in words
+
+
+class Group(Figures, total=False):
+    """Runs that differ in their training seed alone: what is said at the top of the page."""
+
+    seeds: Sequence[int | None]
+    about: str  # whether the interval is about one policy or a mean over training seeds
+    text: str  # one plain sentence: what is certified and what is not
+
+
+class Run(Figures, total=False):
+    """One trained run (one seed) and its evaluation."""
+
+    name: str
+    group: str  # label of the group that it belongs to
+    seed: int
     log: Sequence[LogRow]
 
 
@@ -89,6 +105,7 @@ class Film(TypedDict, total=False):
     edges: Any  # [[i, j], ...] when constant, else [time][[i, j], ...]
     distance: Any  # [time], m: of the worst agent; computed from the target when absent
     lyapunov: Any  # [time] or None
+    function: str  # what `lyapunov` is of: L (default), or the V of a certificate
     cost: Any  # [time]; shown where there is no lyapunov
     success: bool
 
@@ -110,7 +127,10 @@ class Certificate(TypedDict, total=False):
     name: str
     claim: str  # in words
     evidence: str  # proved, statistical or observed
+    run: str  # whose it is
     holds: bool
+    asked: float  # share of the starts that had to be shown
+    shown: str  # the bound in words
     bound: float | str
     confidence: float | str
     scope: str  # start distribution, horizon, disturbance
@@ -131,7 +151,28 @@ class Slice(TypedDict, total=False):
     label: str
     reach: float  # m, half the side of the square that is shown
     radius: float  # m, of success
+    headings: bool  # whether the agents have a heading
+    run: str  # whose it is
     contours: Sequence[Contour]
+
+
+class Training(TypedDict, total=False):
+    """How one run was made."""
+
+    name: str
+    command: str
+    made: str  # date
+    seed: int
+    seconds: float
+    policy: str  # the first digits of its hash
+    versions: Mapping[str, str]
+
+
+class Difference(TypedDict, total=False):
+    """What tells one configuration from the others."""
+
+    name: str
+    fields: str
 
 
 class Page(TypedDict):
@@ -140,17 +181,20 @@ class Page(TypedDict):
     title: str
     subtitle: NotRequired[str]  # task and algorithm in words
     generated: NotRequired[str]  # date
-    summary: NotRequired[Summary]
+    starts: NotRequired[int]  # seed of the starts
+    groups: NotRequired[Sequence[Group]]
     runs: NotRequired[Sequence[Run]]
-    pooled: NotRequired[Sequence[Run]]  # over several seeds; else made from the summary
     films: NotRequired[Sequence[Film]]
     comparisons: NotRequired[Sequence[Comparison]]
     certificates: NotRequired[Sequence[Certificate]]
     slices: NotRequired[Sequence[Slice]]
-    config: NotRequired[Mapping[str, Any]]
-    versions: NotRequired[Mapping[str, str]]
-    command: NotRequired[str]
-    wall_time_s: NotRequired[float]
+    notes: NotRequired[Sequence[str]]  # what is missing, and why
+    config: NotRequired[Mapping[str, Any]]  # that all runs have in common
+    changed: NotRequired[Sequence[str]]  # its fields that are not the default, by dotted name
+    differing: NotRequired[Sequence[Difference]]
+    training: NotRequired[Sequence[Training]]
+    versions: NotRequired[Mapping[str, str]]  # of what made the report
+    command: NotRequired[str]  # that made the report
 
 
 # -------------------------------------------------------------------------------------------------
@@ -161,6 +205,7 @@ class Page(TypedDict):
 PALETTE = ("#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a7d85")
 ALARM = "#d55e00"
 DASH = "–"
+MARK = '<p class="kicker">marlyap report'  # by which a report is known
 
 
 def html(page: Page) -> str:
@@ -197,25 +242,59 @@ def _header(page: Page) -> str:
     head = _tag("p", kicker, cls="kicker") + _tag("h1", _text(page["title"]))
     if page.get("subtitle"):
         head += _tag("p", _text(page.get("subtitle")), cls="lede")
-    return head + _verdict(page.get("summary") or {})
+    groups, starts = page.get("groups") or (), page.get("starts")
+    if len(groups) == 1:
+        head += _verdict(groups[0], starts)
+    elif groups:
+        head += _tag("div", "".join(_one_of_several(group) for group in groups), cls="verdicts")
+    texts = dict.fromkeys(text for group in groups if (text := group.get("text")))
+    head += "".join(_tag("p", _text(text), cls="caveat") for text in texts)
+    return head + "".join(_tag("p", _text(n), cls="caveat warn") for n in page.get("notes") or ())
 
 
-def _verdict(summary: Summary) -> str:
-    rate, interval = _number(summary.get("success_rate")), summary.get("interval")
-    note = _tag("p", _text(summary.get("text")), cls="caveat") if summary.get("text") else ""
+def _verdict(group: Group, starts: Any) -> str:
+    """The large figure of a report about one configuration, and what it stands on."""
+    rate = _number(group.get("success_rate"))
     if rate is None:
-        return note
-    seeds, radius = _number(summary.get("seeds")), _number(summary.get("radius"))
-    count = _tag("strong", _integer(summary.get("successes")))
-    facts = [f"{count} of {_integer(summary.get('episodes'))} episodes succeeded"]
-    if radius is not None:
-        facts.append(f"success within {radius:g} m")
-    if seeds is not None:
-        facts.append(f"{seeds:.0f} training seed{'' if seeds == 1 else 's'}")
-    side = _tag("p", "; ".join(facts)) + _gauge(rate, interval)
-    side += _tag("p", f"exact 95 % interval {_interval(interval)}")
-    figure = _tag("p", _percent(rate), cls="figure")
-    return _tag("div", figure + _tag("div", side), cls="verdict") + note
+        return ""
+    count = _tag("strong", _integer(group.get("successes")))
+    facts = [f"{count} of {_integer(group.get('episodes'))} episodes succeeded"]
+    if (radius := _number(group.get("radius"))) is not None:
+        facts.append(f"success within {radius:g} m at the last step")
+    if starts is not None:
+        facts.append(f"held-out starts of seed {_text(starts)}")
+    side = _tag("p", "; ".join(facts)) + _gauge(rate, group.get("interval"))
+    side += _tag("p", _about(group)) + _tag("p", _afterwards(group))
+    return _tag("div", _tag("p", _percent(rate), cls="figure") + _tag("div", side), cls="verdict")
+
+
+def _one_of_several(group: Group) -> str:
+    """A line about one configuration among others."""
+    rate = _number(group.get("success_rate"))
+    if rate is None:
+        return ""
+    head = _tag("h3", _text(group.get("label"))) + _tag("p", _percent(rate), cls="figure")
+    side = _gauge(rate, group.get("interval")) + _tag("p", _about(group))
+    return _tag("article", head + side + _tag("p", _afterwards(group)))
+
+
+def _about(group: Group) -> str:
+    """What the interval is, and what it is about."""
+    interval, about = _interval(group.get("interval")), _text(group.get("about"), "this policy")
+    if about == "this policy":
+        return f"exact 95 % interval {interval} of {about}"
+    return f"{about}; 95 % interval {interval} for the expectation over training seeds"
+
+
+def _afterwards(group: Group) -> str:
+    """What the team does once it has arrived."""
+    share = lambda part: _percent((part or {}).get("success_rate"))
+    parts = [f"at rest at the last step: {share(group.get('at_rest'))}"] * ("at_rest" in group)
+    if group.get("beyond_steps"):
+        more = _integer(group.get("beyond_steps"))
+        parts.append(f"stays for {more} steps more: {share(group.get('stayed'))}")
+    words = _text(group.get("rests"), "")
+    return "; ".join([_tag("b", words)] * bool(words) + parts)
 
 
 def _gauge(rate: float, interval: Any) -> str:
@@ -238,76 +317,61 @@ def _gauge(rate: float, interval: Any) -> str:
 
 
 def _runs(page: Page) -> str:
-    runs = page.get("runs") or ()
+    runs, groups = page.get("runs") or (), page.get("groups") or ()
     if not runs:
         return ""
-    radii = sorted({radius for run in runs for radius, *_ in _within(run)})
-    head = ["Run", "Success", "95 % interval", *[f"within {radius:g} m" for radius in radii]]
-    head += ["Final distance (m)", "Settling time (s)", "Return"]
-    body = [_run_row(run, radii, c) for run, c in zip(runs, _colours(runs), strict=True)]
-    body += [_run_row(run, radii) for run in _pooled(page)]
+    radii = sorted({radius for run in runs for radius, *_ in _within(run)})[:1]
+    ruled = any(_number((run.get("violations") or {}).get("success_rate")) for run in runs)
+    head = ["Run", "Success", "95 % interval", "At rest", "Stays", *["Violations"] * ruled]
+    head += [*[f"within {radius:g} m" for radius in radii], "Final distance (m)", "speed (m/s)"]
+    head += ["spin (rad/s)", "Settling time (s)", "Return"]
+    body = [_run_row(run, radii, ruled, c) for run, c in zip(runs, _colours(runs), strict=True)]
+    body += [_run_row(g, radii, ruled) for g in groups if len(g.get("seeds") or ()) > 1]
+    more = next((n for run in runs if (n := _number(run.get("beyond_steps")))), None)
     note = (
-        "Each run was evaluated on fresh starts with its deterministic policy. Distances are those "
-        "of the worst robot at the last step. Two figures in a cell: the median, and what 95 % of "
-        "the episodes stay under."
+        "Each run was evaluated on the same held-out starts with its deterministic policy. At "
+        "rest: no agent faster than 0.1 m/s or 0.1 rad/s at the last step. "
+        + (f"Stays: succeeds in every one of {more:,.0f} steps more. " if more else "")
+        + "Distance, speed and spin are those of the worst agent at the last step. Two figures in "
+        "a cell: the median, and what 95 % of the episodes stay under."
     )
     return _section("Runs", _table(head, body), note)
 
 
-def _run_row(run: Run, radii: Sequence[float], colour: int | None = None) -> str:
-    """One run with its colour, or a pooled row without."""
+def _run_row(
+    run: Run | Group, radii: Sequence[float], ruled: bool, colour: int | None = None
+) -> str:
+    """One run with its colour, or a group of several seeds without."""
     mark = "" if colour is None else _tag("i", cls=f"swatch c{colour}")
     rate = _tag("b", _percent(run.get("success_rate")))
     cells = [f"{_integer(run.get('successes'))} / {_integer(run.get('episodes'))} {rate}"]
     cells.append(_interval(run.get("interval")))
+    shares = [run.get("at_rest"), run.get("stayed") if run.get("beyond_steps") else None]
+    shares += [run.get("violations")] * ruled
+    cells += [_percent((share or {}).get("success_rate")) for share in shares]
     within = {radius: rate for radius, rate, *_ in _within(run)}
     cells += [_percent(within.get(radius)) for radius in radii]
-    for quantiles, digits in ((run.get("final_distance"), 3), (run.get("settling_time"), 1)):
+    columns = [(run.get("final_distance"), 3), (run.get("final_speed"), 2)]
+    for quantiles, digits in (*columns, (run.get("final_spin"), 2), (run.get("settling_time"), 1)):
         both = [_decimal(_quantile(quantiles, q), digits) for q in (0.5, 0.95)]
         cells.append(" / ".join(both) if quantiles else DASH)
     cells.append(_decimal(run.get("return_mean"), 2))
-    return _row(mark + _text(_name(run)), cells, "pooled" if colour is None else "")
+    about = f": {run['about']}" if "about" in run else ""
+    return _row(mark + _text(_name(run) + about), cells, "pooled" if colour is None else "")
 
 
-def _within(run: Run) -> list[tuple[float, float, float, float]]:
+def _within(run: Figures) -> list[tuple[float, float, float, float]]:
     """What is known of success by radius: radius, rate, and the ends of the interval."""
     known = []
     for within in run.get("radii") or ():
-        radius, rate = _number(within.get("radius")), _number(within.get("rate"))
+        radius, rate = _number(within.get("radius")), _number(within.get("success_rate"))
         if radius is not None and rate is not None:
             known.append((radius, rate, *(_pair(within.get("interval")) or (rate, rate))))
     return sorted(known)
 
 
-def _name(run: Run) -> str:
+def _name(run: Any) -> str:
     return run.get("label") or run.get("name") or DASH
-
-
-def _pooled(page: Page) -> Sequence[Run]:
-    """The pooled rows given, or one made from the summary when it is of all the runs."""
-    runs, summary = page.get("runs") or (), page.get("summary") or {}
-    if page.get("pooled"):
-        return page.get("pooled") or ()
-    episodes = sum(_number(run.get("episodes")) or 0 for run in runs)
-    if len(runs) < 2 or not episodes or episodes != _number(summary.get("episodes")):
-        return ()
-    pooled = Run(label="pooled", radii=_pooled_radii(runs))
-    pooled.update({key: summary[key] for key in _COUNTS if key in summary})  # type: ignore[typeddict-item]
-    return (pooled,)
-
-
-_COUNTS = ("episodes", "successes", "success_rate", "interval")
-
-
-def _pooled_radii(runs: Sequence[Run]) -> list[Within]:
-    """The rates over all episodes of all runs, at the radii that every run has."""
-    weights = [_number(run.get("episodes")) or 0.0 for run in runs]
-    rates = [{radius: rate for radius, rate, *_ in _within(run)} for run in runs]
-    common = set.intersection(*(set(known) for known in rates))
-    return [
-        {"radius": r, "rate": float(np.average([known[r] for known in rates], weights=weights))}
-        for r in sorted(common)
-    ]
 
 
 def _comparisons(comparisons: Sequence[Comparison]) -> str:
@@ -338,25 +402,44 @@ def _certificates(certificates: Sequence[Certificate], slices: Sequence[Slice]) 
         "among the films above."
     )
     figures = "".join(
-        _captioned(_slice(part), f"{_tag('b', 'V')} along {_text(part.get('label'))}")
+        _captioned(_slice(part), f"{_tag('b', 'V')} along {_of(part.get('label'), part)}")
         for part in slices
     )
-    charts = _tag("div", figures, cls="charts") if figures else ""
+    charts = _tag("div", figures, cls="charts slices") if figures else ""
     if figures:
+        facing = ", facing right," if any(part.get("headings") for part in slices) else ""
+        dashed = any(c.get("certified") for part in slices for c in part.get("contours") or ())
         words = (
-            "Level sets of V where one agent rests beside its goal, facing right, and all others "
-            "rest on theirs. The dashed line is the level that was certified, the ring the target."
+            f"Level sets of V where one agent rests beside its goal{facing} and all others rest on "
+            "theirs. The ring is the target"
+            + ("; the dashed line is the level that was certified." if dashed else ".")
         )
         charts = _tag("p", words, cls="note") + charts
     return _section("Certificates", _tag("div", claims, cls="claims") + charts, note)
 
 
+def _of(text: Any, part: Mapping[str, Any]) -> str:
+    """Something, and whose it is where that is said."""
+    return _text(text) + (f" · {_text(part.get('run'))}" if part.get("run") else "")
+
+
 def _claim(c: Certificate) -> str:
-    holds = c.get("holds")
-    mark = {True: ("holds", "holds"), False: ("fails", "does not hold")}.get(holds)  # type: ignore[arg-type]
-    verdict = _tag("span", mark[1], cls=f"mark {mark[0]}") if mark else ""
-    head = _tag("h3", _text(c.get("name") or "claim") + verdict)
-    facts = {key: c.get(key) for key in ("evidence", "bound", "confidence", "scope", "text")}
+    """One claim: what was asked, what was shown, and whether that is enough."""
+    holds, asked, shown = c.get("holds"), _number(c.get("asked")), _number(c.get("bound"))
+    share = asked is not None and shown is not None and holds == (shown >= asked)
+    words = {
+        True: "reached" if share else "holds",
+        False: "not reached" if share else "does not hold",
+    }
+    kind = "holds" if holds else "fails"
+    verdict = "" if holds is None else _tag("span", words[holds], cls=f"mark {kind}")
+    head = _tag("h3", _of(c.get("name") or "claim", c) + verdict)
+    facts: dict[str, Any] = {"evidence": c.get("evidence")}
+    if share:
+        facts |= {"asked": _percent(asked), "shown": c.get("shown", _percent(shown))}
+    else:
+        facts |= {"bound": c.get("bound")}
+    facts |= {key: c.get(key) for key in ("confidence", "scope", "text")}
     pairs = "".join(
         _tag("div", _tag("dt", key) + _tag("dd", _any(value)))
         for key, value in facts.items()
@@ -397,16 +480,40 @@ def _level(contour: Contour, scale: float) -> str:
 
 
 def _making(page: Page) -> str:
-    facts = [("wall time", _duration(page["wall_time_s"]))] if "wall_time_s" in page else []
-    facts += [(name, _any(value)) for name, value in (page.get("versions") or {}).items()]
+    body = _trainings(page.get("training") or ())
+    if differing := page.get("differing"):
+        rows = [_row(_text(d.get("name")), [_text(d.get("fields"))]) for d in differing]
+        body += _tag("h3", "What differs") + _table(["Configuration", "Fields"], rows, (0, 1))
+    changed = set(page.get("changed") or ())
     config = [(path, _any(value)) for path, value in _flatten(page.get("config") or {})]
-    command = page.get("command")
-    body = _tag("pre", _text(command), cls="command") if command else ""
-    for title, pairs in (("Versions and time", facts), ("Configuration", config)):
-        if pairs:
-            rows = [_tag("div", _tag("dt", _text(k)) + _tag("dd", v)) for k, v in pairs]
-            body += _tag("h3", title) + _tag("dl", "".join(rows), cls="pairs")
+    marked = [(_tag("b", _text(k)) if k in changed else _text(k), v) for k, v in config]
+    bold = " (bold: not the default)" if any(k in changed for k, _ in config) else ""
+    body += _pairs(("Configuration in common" if differing else "Configuration") + bold, marked)
+    if command := page.get("command"):
+        body += _tag("h3", "This report") + _tag("pre", _text(command), cls="command")
+    versions = [(_text(k), _any(v)) for k, v in (page.get("versions") or {}).items()]
+    body += _pairs("Versions that made this report", versions)
     return _section("How it was made", body) if body else ""
+
+
+def _pairs(title: str, pairs: Sequence[tuple[str, str]]) -> str:
+    rows = [_tag("div", _tag("dt", k) + _tag("dd", v)) for k, v in pairs]
+    return _tag("h3", title) + _tag("dl", "".join(rows), cls="pairs") if rows else ""
+
+
+def _trainings(trainings: Sequence[Training]) -> str:
+    """When, how long and with what each run was trained, and by which command."""
+    if not trainings:
+        return ""
+    head = ["Run", "Seed", "Made", "Wall time", "Policy", "With"]
+    body = []
+    for t in trainings:
+        versions = ", ".join(f"{k} {v}" for k, v in (t.get("versions") or {}).items())
+        cells = [_integer(t.get("seed")), _text(t.get("made") or None), _duration(t.get("seconds"))]
+        body.append(_row(_text(t.get("name")), [*cells, _text(t.get("policy")), _text(versions)]))
+    commands = dict.fromkeys(command for t in trainings if (command := t.get("command")))
+    said = "".join(_tag("pre", _text(command), cls="command") for command in commands)
+    return _tag("h3", "Training") + said + _table(head, body, words=(0, 5))
 
 
 def _flatten(tree: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
@@ -469,16 +576,16 @@ def _legend(runs: Sequence[Run]) -> str:
 
 
 def _groups(runs: Sequence[Run]) -> list[str]:
-    """The algorithms, in order of appearance."""
+    """The configurations, in order of appearance."""
     return list(dict.fromkeys(_group(run) for run in runs))
 
 
 def _group(run: Run) -> str:
-    return run.get("algorithm") or ""
+    return run.get("group") or ""
 
 
 def _colours(runs: Sequence[Run]) -> list[int]:
-    """One colour per algorithm when there are several, else one per run."""
+    """One colour per configuration when there are several, else one per run."""
     groups = _groups(runs)
     if len(groups) > 1:
         return [groups.index(_group(run)) % len(PALETTE) for run in runs]
@@ -503,7 +610,7 @@ def mean_curve(curves: Sequence[Curve]) -> Curve:
 
 
 def _learning_chart(runs: Sequence[Run], key: Literal["success", "return"]) -> tuple[str, str]:
-    """Caption and picture: thin a line per run, thick the mean of each algorithm."""
+    """Caption and picture: thin a line per run, thick the mean of each configuration."""
     scale = 100 if key == "success" else 1
     curves = [(x, scale * y) for x, y in (learning_curve(run, key) for run in runs)]
     if not any(len(x) for x, _ in curves):
@@ -627,6 +734,7 @@ class Scene:
     distance: np.ndarray  # [time]
     level: np.ndarray | None  # [time]: L, or the cost
     level_name: str
+    rises: bool  # whether it should fall, and its rises are marked
     success: bool | None
     view: tuple[float, float, float]  # centre and side of the square to show
 
@@ -681,7 +789,8 @@ def _scene(film: Film) -> Scene | None:
         edges=_edges(film.get("edges"), time),
         distance=_distance(film, positions, targets),
         level=None if name is None else _over(film.get(name), time),
-        level_name={"lyapunov": "L", "cost": "cost", None: ""}[name],
+        level_name=str(film.get("function") or "L") if name == "lyapunov" else name or "",
+        rises=name == "lyapunov",
         success=None if film.get("success") is None else bool(film.get("success")),
         view=_view(positions, targets, radius),
     )
@@ -737,6 +846,7 @@ def _film(scene: Scene) -> dict[str, Any]:
         "distance": _plain(scene.distance),
         "level": None if scene.level is None else _plain(scene.level, significant=True),
         "levelName": scene.level_name,
+        "rises": scene.rises,
         "view": _plain(np.array(scene.view)),
     }
 
@@ -746,7 +856,7 @@ def _episodes(shown: Sequence[Scene]) -> str:
     return "".join(
         _tag(
             "button",
-            f"{_tag('b', _text(scene.label))} {_tag('span', _outcome(scene, shown))}",
+            f"{_tag('b', _text(scene.label))} {_tag('span', _outcome(scene))}",
             type="button",
             data_film=k,
             aria_pressed="true" if k == 0 else "false",
@@ -755,16 +865,16 @@ def _episodes(shown: Sequence[Scene]) -> str:
     )
 
 
-def _outcome(scene: Scene, shown: Sequence[Scene]) -> str:
-    """Whose episode it is, where there are several, and how it went."""
-    run = [scene.run] if scene.run and len({other.run for other in shown}) > 1 else []
+def _outcome(scene: Scene) -> str:
+    """Whose episode it is, where that is said, and how it went."""
+    run = [scene.run] if scene.run else []
     end = {None: [], True: ["success"], False: ["failure"]}[scene.success]
     return _text(" · ".join([*run, scene.detail, *end]))
 
 
 def _starts(shown: Sequence[Scene], most: int = 6) -> str:
     figures = [
-        _captioned(_panel(scene), f"{_tag('b', _text(scene.label))} {_outcome(scene, shown)}")
+        _captioned(_panel(scene), f"{_tag('b', _text(scene.label))} {_outcome(scene)}")
         for scene in shown[:most]
     ]
     note = (

@@ -318,6 +318,68 @@ def probability_of_improvement(
     return Improvement(float(wins.mean()), _percentiles(replicates, confidence))
 
 
+def mean_bound(values: Any, confidence: Any) -> float:
+    """One-sided upper confidence bound on the expectation of values that lie in [0, 1].
+
+    The `confidence` quantile of sum_i G_i x_(i), with x_(n+1) = 1 and G uniform on the simplex of
+    n + 1 weights (Dirichlet(1, ..., 1)): what the mean would be if the distribution put random
+    masses between the ordered values, always at the upper end of each gap. The density of that sum
+    is a B-spline with the ordered values as its knots, so the quantile is found without sampling.
+    For values of 0 and 1 it is `upper_bound`, and for one value Markov's inequality. For n > 1
+    and other values its coverage is conjectured, not proved; no counterexample is known, and
+    reliability/coverage.py searches for one.
+
+    Arguments: values, Float["n"], independent draws from one distribution on [0, 1]; confidence in
+    (0, 1).
+    Raises: StatisticsError (a UserError and a ValueError) when a value is outside [0, 1] or the
+    confidence outside (0, 1).
+    Source: Gaffke, "Three test statistics for a nonparametric one-sided hypothesis on the mean of a
+    nonnegative variable", Mathematical Methods of Statistics 14, 2005; Learned-Miller and Thomas,
+    "A new confidence interval for the mean of a bounded random variable", arXiv:1905.06208, 2020;
+    Curry and Schoenberg, Journal d'Analyse Mathematique 17, 1966, for the B-spline.
+    """
+    confidence, knots = _fraction("confidence", confidence), _knots(values)
+    if knots[0] == 1.0:
+        return 1.0
+    below = _mixture(knots)
+    return float(scipy.optimize.brentq(lambda m: below(m) - confidence, knots[0], 1.0, xtol=1e-12))
+
+
+def mean_covered(values: Any, mean: Any, confidence: Any) -> bool:
+    """Whether `mean <= mean_bound(values, confidence)`, without finding the bound."""
+    confidence, knots = _fraction("confidence", confidence), _knots(values)
+    return bool(knots[0] >= mean or _mixture(knots)(mean) <= confidence)
+
+
+def mean_interval(values: Any, confidence: Any = 0.95) -> Interval:
+    """Interval for the expectation of values in [0, 1], with (1 - confidence) / 2 in each tail.
+
+    No distribution is assumed and few values will do, so success rates of a handful of training
+    seeds qualify: it is then about the expected rate of a policy trained with a new seed, on the
+    starts that all of them were measured on. For values of 0 and 1 it is `clopper_pearson`.
+    Arguments, errors raised, source and the state of its proof are those of `mean_bound`.
+    """
+    side = (1.0 + _fraction("confidence", confidence)) / 2.0
+    values = _numbers("values", values, 1, 1, finite=True)
+    return Interval(1.0 - mean_bound(1.0 - values, side), mean_bound(values, side))
+
+
+def _knots(values: Any) -> np.ndarray:
+    values = np.sort(_numbers("values", values, 1, 1, finite=True))
+    if values[0] < 0.0 or values[-1] > 1.0:
+        raise StatisticsError("values must lie between 0 and 1.")
+    return np.append(values, 1.0)
+
+
+def _mixture(knots: np.ndarray) -> Callable[[float], float]:
+    """The distribution function of sum_i G_i knots_i, between two knots that differ."""
+    density = scipy.interpolate.BSpline.basis_element(knots, extrapolate=False)
+    total = density.antiderivative()
+    scale = (len(knots) - 1) / (knots[-1] - knots[0])
+    # A spline with a knot of full multiplicity at its right end has no value there.
+    return lambda m: scale * float(total(m) - total(knots[0])) if m < knots[-1] else 1.0
+
+
 def quantile_upper_bound(sample: Any, q: Any, confidence: Any) -> float:
     """Distribution-free one-sided upper confidence bound on the q-quantile.
 

@@ -9,18 +9,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap.certificate import AbstractCertificate, start_of
-from marlyap.certificates import CERTIFICATES, bounds
+from marlyap.certificate import (
+    AbstractCertificate,
+    Verdict,
+    failures_allowed,
+    percent,
+    sentence,
+    start_of,
+)
+from marlyap.certificates import CERTIFICATES, bounds, quantiles
 from marlyap.certificates.basin import Basin, largest_level
 from marlyap.certificates.closed_form import ClosedForm
 from marlyap.certificates.composition import Composition, fit_row
-from marlyap.certificates.contraction import Contraction, failures_allowed
+from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
+from marlyap.certificates.information import information
 from marlyap.certificates.linearisation import Linearisation
-from marlyap.certificates.proof import Loop, Proof, extents, lyapunov
+from marlyap.certificates.proof import Loop, Proof, extents, halves, lyapunov
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness
+from marlyap.certificates.safety import Apart, Safe
 from marlyap.certificates.theorem1 import Theorem1, input_jacobian, l_f
 from marlyap.certify import certify, save
 from marlyap.controllers.point_offset import PointOffset
@@ -33,6 +42,7 @@ from marlyap.nets import Actors, Greedy, NormNet, Shape
 from marlyap.perturb import Perturbed
 from marlyap.rollout import Decentralised
 from marlyap.statistics import lower_bound
+from marlyap.tasks.formation import Formation
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State
 
@@ -213,11 +223,12 @@ def test_a_ball_is_taken_that_the_controller_keeps():
     beside = Straying(jnp.asarray(1.1 * radius))
     result = certified(POINT, beside)
     assert result["V"]["ball"] == 2 * radius
-    assert "beyond 0.2 m" in result["verdicts"]["decrease"]["claim"]
+    claim = result["verdicts"]["decrease"]["claim"]
+    assert "V, the sum of the next 20 costs beyond 0.2 m, falls" in claim
     assert not result["verdicts"]["reach"]["holds"]
 
 
-def test_only_claims_about_v_need_one():
+def test_what_needs_v_is_left_out_by_name_and_the_others_run():
     """Of a controller that leaves the target all that does not speak of V can still be said."""
     away = Straying(jnp.asarray(9 * POINT.radius))
     spoken = {name for name, c in TABLE.items() if c.asks_V}
@@ -225,7 +236,18 @@ def test_only_claims_about_v_need_one():
     for name in spoken:
         with pytest.raises(UserError, match="certificates that do not ask for one"):
             certified(POINT, away, {name: TABLE[name]})
-    assert not certified(POINT, away, {"reach": TABLE["reach"]})["holds"]
+    result = certified(POINT, away)
+    assert {*result["left_out"]} == spoken and {*result["verdicts"]} == {*TABLE} - spoken
+    assert all("on the target set" in why for why in result["left_out"].values())
+    # The confidence is shared by those that ran, and the left-out ones fail if asked for by name.
+    assert result["confidence_each"] == pytest.approx(1 - 0.01 / 3)
+    table = {"far": Apart(N, N), **{n: TABLE[n] for n in spoken}}
+    team = Rendezvous(agents=2, leaders=(0, 1), dynamics=SingleIntegrator(limits=(2.0, 2.0)))
+    table["far"] = dataclasses.replace(table["far"], least=1e-4)
+    asked = certified(team, Straying(jnp.asarray(0.9)), table)
+    usual = certified(team, Straying(jnp.asarray(0.9)), table, optional=table)
+    assert {*asked["verdicts"]} == {"far"} and {*usual["left_out"]} == spoken
+    assert not asked["holds"] and usual["holds"] == usual["verdicts"]["far"]["holds"]
 
 
 def test_bad_input_is_one_sentence():
@@ -233,7 +255,10 @@ def test_bad_input_is_one_sentence():
     with pytest.raises(UserError, match=r"at least \d+ are needed"):
         certified(POINT, Scripted(), few)
     with pytest.raises(UserError, match="on the target set"):
-        certified(POINT, Scripted(spin=jnp.asarray(1.0)), V=Shifted())
+        spoken = {"decrease": TABLE["decrease"]}
+        certified(POINT, Scripted(spin=jnp.asarray(1.0)), spoken, V=Shifted())
+    with pytest.raises(UserError, match="one row for each agent"):
+        certified(POINT, lambda state, key: jnp.zeros(3))
     with pytest.raises(UserError, match="fixed beforehand"):
         certified(POINT, Scripted(), few, policy="0" * 64)
     with pytest.raises(UserError, match="at least one"):
@@ -259,6 +284,38 @@ def test_a_result_is_json_and_repeats(tmp_path):
     save(tmp_path / "c", first, POINT, Scripted())
     with pytest.raises(UserError, match="not the one"):
         save(tmp_path / "d", first, POINT, Scripted(spin=jnp.asarray(1.0)))
+
+
+def test_a_sentence_says_what_was_asked_and_what_was_shown():
+    """The claim is true whatever was asked: what fails is the share asked for."""
+    verdict = Verdict("reach", "at least 95.22 % of starts arrive", "statistical", False, 0.95229,
+                      0.99983, {}, figures={"share_asked": 0.98})  # fmt: skip
+    said = "Asked 98 %, shown 95.22 % (confidence 99.98 %): not reached."
+    assert sentence(verdict) == f"reach: at least 95.22 % of starts arrive. {said}"
+    better = dataclasses.replace(verdict, bound=0.9812, holds=True)
+    assert sentence(better).endswith("Asked 98 %, shown 98.12 % (confidence 99.98 %): reached.")
+    other = dataclasses.replace(better, holds=False)  # for another reason than the share
+    assert sentence(other).endswith("arrive: does not hold.")
+    none = dataclasses.replace(better, figures={})
+    assert sentence(none) == "reach: at least 95.22 % of starts arrive: holds."
+    # 0.98 is shown in full, and what is just below it is not called 98 %.
+    assert [percent(x) for x in (0.98, 0.97999, 0.57, 1.0)] == [
+        "98.00 %",
+        "97.99 %",
+        "57.00 %",
+        "100.00 %",
+    ]
+    assert percent(0.12341, up=True) == "12.35 %"
+
+
+def test_every_claim_says_until_when_and_nothing_of_later():
+    claims = {name: v["claim"] for name, v in certified(POINT, Scripted())["verdicts"].items()}
+    assert claims["reach"].endswith("% of starts end with every agent within 0.1 m of its goal "
+                                    "at 4 s")  # fmt: skip
+    assert "until step 80 (8 s)" in claims["reach-and-stay"]
+    assert "by step 40 (4 s)" in claims["decrease"]
+    assert all("until step 40 (4 s)" in claims[name] for name in ("contraction", "quantiles"))
+    assert not any("share" in claim for claim in claims.values())
 
 
 def test_levels_and_failures_by_hand():
@@ -347,6 +404,111 @@ def test_composition(A, fine):
     assert result["holds"] == fine
 
 
+class Near(Flow):
+    """The same from starts within a small box (m)."""
+
+    start: float = 0.03
+
+    def reset(self, key):
+        state = super().reset(key)
+        return State(x=state.x * self.start / 2, goal=state.goal, t=state.t)
+
+
+@pytest.mark.parametrize(
+    "growth, start", [(1.2 ** (1 / 40), 0.03), (2 ** (1 / 40), 0.01), (1.00001, 0.03)]
+)
+def test_composition_of_what_grows_is_refused(growth, start):
+    """From starts inside their own bound the inequalities hold for a while, and say nothing."""
+    game = Near(growth * jnp.eye(2), jnp.asarray(0.0), start=start)
+    verdict = Composition(rollouts=N, calibration=N).check(game, Idle(), Quadratic(jnp.eye(2)), 0)
+    assert not verdict.holds and verdict.claim.startswith("nothing was contracted")
+    assert verdict.bound is None and sentence(verdict).endswith(": does not hold.")
+
+
+def test_composition_says_until_when():
+    verdict = Composition(rollouts=N, calibration=N).check(
+        flow([[0.8, 0.0], [0.0, 0.8]]), Idle(), Quadratic(jnp.eye(2)), 0
+    )
+    assert verdict.holds and "until step 90 (9 s)" in verdict.claim
+    assert verdict.figures["begin_above"] > N / 2 and np.any(verdict.figures["M"])
+
+
+class Dips(Quadratic):
+    """A quadratic form that is negative on a strip which some rollouts cross."""
+
+    P: jax.Array = eqx.field(default_factory=lambda: jnp.eye(2))
+
+    def value(self, game, state):
+        strip = jnp.abs(state.x[0, 0] - 1.0) < 0.002
+        return super().value(game, state) * jnp.where(strip, -1e-3, 1.0)
+
+
+def test_a_negative_v_is_no_lyapunov_function():
+    game = flow([[0.8, 0.0], [0.0, 0.8]])
+    table = {name: TABLE[name] for name in ("decrease", "basin", "quantiles")}
+    table["theorem1"] = Theorem1(rollouts=N, share=0.95)
+    assert holding(certified(game, Idle(), table, V=Quadratic(jnp.eye(2)))) == set(table)
+    result = certified(game, Idle(), table, V=Dips())
+    for verdict in result["verdicts"].values():
+        assert not verdict["holds"] and verdict["bound"] is None
+        assert "rollouts, so it is no Lyapunov function" in verdict["claim"]
+
+
+def test_a_verdict_on_nothing_does_not_hold():
+    """Starts inside the ball and an unstable plant: no transition and no window to judge."""
+    game = Near(1.02 * jnp.eye(2), jnp.asarray(0.0), start=0.02)
+    for certificate in (TABLE["decrease"], TABLE["contraction"]):
+        verdict = certificate.check(game, Idle(), Quadratic(jnp.eye(2)), 0)
+        assert not verdict.holds and verdict.claim.startswith("nothing to judge: 0 of 600")
+        assert verdict.trials == verdict.bound == 0
+
+
+def test_trials_are_what_leaves_something_to_judge():
+    """Half of the starts lie inside the ball; of them a decrease says nothing."""
+    game = Near(0.8 * jnp.eye(2), jnp.asarray(0.0), start=0.15)
+    verdict = TABLE["decrease"].check(game, Idle(), Quadratic(jnp.eye(2)), 0)
+    outside = 1 - np.pi * 0.1**2 / 0.3**2
+    assert verdict.holds and verdict.trials == pytest.approx(outside * N, rel=0.1)
+    assert verdict.figures["drawn"] == N
+
+
+def test_growth_is_not_called_contraction():
+    game = flow([[1.05, 0.0], [0.0, 1.05]])
+    verdict = TABLE["contraction"].check(game, Idle(), Quadratic(jnp.eye(2)), 0)
+    assert not verdict.holds and verdict.figures["beta"] == pytest.approx(1 - 1.05**20, rel=1e-3)
+    assert verdict.claim.startswith("the cost does not contract") and "grows by" in verdict.claim
+    assert verdict.bound > 0.95 and sentence(verdict).endswith(": does not hold.")
+
+
+def test_an_infinite_bound_reads_unbounded():
+    verdict = TABLE["quantiles"].check(
+        flow([[1.0, 0.0], [0.0, 1.0]]), Idle(), Quadratic(jnp.eye(2)), 0
+    )
+    assert "settling time unbounded;" in verdict.claim and not verdict.holds
+    bounds = {"final_distance": 0.04121, "settling_time": 3.8, "largest_rise": np.inf}
+    said = quantiles.claim(0.95, bounds, "a form", 40, 0.1)
+    assert "final distance at most 0.04121 m; settling time at most 3.8 s" in said
+    assert "largest rise unbounded of V" in said
+    assert quantiles.at_most(0.123401) == "at most 0.1235"  # an upper bound is rounded up
+
+
+def test_perturbations_that_cannot_be_applied_are_named():
+    class Judged(Rendezvous):
+        def success(self, state):
+            return jnp.all(self.distance(state) <= self.radius)
+
+    few = Robustness(400, (0.5,), (), (), (), (), share=0.9)
+    game = Judged(agents=2, graph="path", dynamics=SingleIntegrator())
+    verdict = few.check(game, lambda s, k: s.goal - s.x, CostSum(Idle()), 0)
+    assert "without agent 1" in verdict.figures["without"]
+    assert "(left out: without agent 1, because an agent of Judged" in verdict.claim
+    assert (
+        "without agent" not in verdict.scope["disturbance"] and len(verdict.figures["curve"]) == 2
+    )
+    with pytest.raises(UserError, match="gain 0.5, because the inputs of this game"):
+        few.check(flow([[0.8, 0.0], [0.0, 0.8]]), Idle(), CostSum(Idle()), 0)
+
+
 def test_composition_fits_a_known_row():
     """V_0+ = 0.5 V_0 + 0.25 V_1 exactly."""
     linked = np.array([[False, True], [True, False]])
@@ -376,10 +538,125 @@ def test_the_linearisation_says_no_to_the_unicycle():
     game = Rendezvous(agents=1)
     verdict = Linearisation().check(game, Idle(), CostSum(Idle()), 0)
     assert not verdict.holds and verdict.figures["controllability_rank"] == 4
-    assert verdict.claim.startswith("transverse-exponential: NO")
-    assert verdict.figures["uncontrollable_eigenvalues"] == [1.0]
+    assert verdict.claim.startswith("NO") and verdict.evidence == "proved"
+    assert verdict.figures["uncontrollable_eigenvalues"] == pytest.approx([1.0])
     assert Linearisation().check(POINT, Scripted(), CostSum(Idle()), 0).holds
     assert not Linearisation().check(POINT, Idle(), CostSum(Idle()), 0).holds
+
+
+class Holonomic(Rendezvous):
+    """Robots called unicycles that its own step moves straight to the goal, by 0.6 a step."""
+
+    def step(self, state, action):
+        p = state.goal + 0.6 * (state.x[:, :2] - state.goal)
+        x = jnp.concatenate([p, 0.6 * state.x[:, 2:]], axis=1)
+        return State(x=x + 0.0 * jnp.sum(action), goal=state.goal, t=state.t + 1)
+
+    def errors(self, state):
+        return jnp.concatenate([state.x[:, :2] - state.goal, state.x[:, 2:]], axis=1)
+
+    def reset(self, key):
+        start = super().reset(key)
+        return eqx.tree_at(lambda s: s.x, start, start.x.at[:, 2].set(0.0))
+
+
+def test_the_linearisation_is_of_the_games_own_step():
+    verdict = Linearisation().check(Holonomic(agents=1), Idle(), CostSum(Idle()), 0)
+    assert verdict.evidence == "observed" and verdict.holds
+    assert verdict.bound == pytest.approx(0.6, abs=1e-12)
+
+
+@pytest.mark.parametrize("A, fine", [(0.99, True), (0.9995, False), (0.99999994, False),
+                                     (1.0, False), (1.00001, False)])  # fmt: skip
+def test_the_linearisation_keeps_a_margin(A, fine):
+    verdict = Linearisation().check(flow([[A, 0.0], [0.0, A]]), Idle(), CostSum(Idle()), 0)
+    assert verdict.holds == fine
+
+
+def test_the_linearisation_asks_for_an_equilibrium_that_does_not_move():
+    beside = Linearisation().check(POINT, Straying(jnp.asarray(0.05)), CostSum(Idle()), 0)
+    assert not beside.holds and beside.claim.startswith("the goal is no equilibrium: on it the")
+    assert "agents move by 0.04 in a step" in beside.claim
+    late = Linearisation().check(POINT, Scripted(leave=jnp.asarray(45)), CostSum(Idle()), 0)
+    assert not late.holds and "depends on the time" in late.claim
+
+    class Drifting(Flow):
+        def step(self, state, action):
+            after = super().step(state, action)
+            return eqx.tree_at(lambda s: s.x, after, after.x + 0.01)
+
+    moving = Drifting(jnp.eye(2) * 0.5, jnp.asarray(0.0))
+    verdict = Linearisation().check(moving, Idle(), CostSum(Idle()), 0)
+    assert not verdict.holds and "without an action the agents move" in verdict.claim
+    kinked = lambda state, key: -3.0 * jnp.abs(state.x - state.goal)
+    verdict = Linearisation().check(POINT, kinked, CostSum(Idle()), 0)
+    assert not verdict.holds and "no derivative" in verdict.claim
+
+
+class Meeting(Flow):
+    """Two points on lines whose error is their gap alone: the target set is a line."""
+
+    agents: int = 2
+
+    def reset(self, key):
+        x = jax.random.normal(key, (2, 2))
+        return State(x=x, goal=jnp.zeros((2, 2)), t=jnp.asarray(0))
+
+    def errors(self, state):
+        return state.x - state.x[::-1]
+
+    def step(self, state, action):
+        x = state.x + 0.1 * (action - jnp.mean(action, axis=0, keepdims=True))
+        return State(x=x, goal=state.goal, t=state.t + 1)
+
+
+def test_an_eigenvalue_along_the_target_set_is_harmless():
+    """No input moves the mean of the two, and no error sees it: nothing is impossible."""
+    game = Meeting(jnp.eye(2), jnp.asarray(0.0))
+    verdict = Linearisation().check(game, lambda s, k: -(s.x - s.goal), CostSum(Idle()), 0)
+    assert verdict.figures["controllability_rank"] == 2 and not verdict.holds
+    assert verdict.figures["uncontrollable_eigenvalues"] == []
+    assert verdict.evidence == "observed" and "no stability is shown" in verdict.claim
+
+
+def test_formulas_are_about_their_own_model_only():
+    class Sticky(Rendezvous):
+        def step(self, state, action):
+            return super().step(state, 0.9 * action)
+
+    one, law = Sticky(agents=1), PointOffset(Sticky(agents=1))
+    with pytest.raises(UserError, match="Sticky has another `step`"):
+        ClosedForm().check(one, law, CostSum(law), 0)
+    policy = Decentralised(
+        policy_of(GAINS)[1].policy, Sticky(agents=1, dynamics=DoubleIntegrator())
+    )
+    with pytest.raises(UserError, match="another `step`"):
+        ANNULUS.check(policy.game, policy, FORM, 0)
+    other = Rendezvous(agents=1, dynamics=Unicycle(limits=(1.0, 1.0)))
+    with pytest.raises(UserError, match="made for another game"):
+        ClosedForm().check(Rendezvous(agents=1), PointOffset(other), CostSum(law), 0)
+
+    class Slippery(DoubleIntegrator):
+        def step(self, x, action, dt):
+            return 0.999 * super().step(x, action, dt)
+
+    with pytest.raises(UserError, match="not Slippery"):
+        game = Rendezvous(agents=1, dynamics=Slippery())
+        ANNULUS.check(game, Decentralised(policy.policy, game), FORM, 0)
+
+
+def test_a_proof_about_nothing_is_refused():
+    game, stable = policy_of(GAINS)
+    for wrong in (dict(c=1e6, rho=1e5, inner=1e5), dict(eta=-1.0), dict(eta=0.0)):
+        with pytest.raises(UserError, match="nothing to prove|V must fall"):
+            dataclasses.replace(ANNULUS, **wrong).check(game, stable, FORM, 0)
+
+
+def test_split_boxes_overlap_however_far_out():
+    boxes = np.array([[[1e3, 0.0, 0.0, 0.0], [1e-6, 0.0, 0.0, 0.0]]])
+    left, right = halves(boxes, np.ones((1, 4)))
+    assert left[0, 0] + left[1, 0] > right[0, 0] - right[1, 0]
+    assert left[0, 0] - left[1, 0] < 1e3 - 1e-6 and right[0, 0] + right[1, 0] > 1e3 + 1e-6
 
 
 def policy_of(K, hidden=16):
@@ -468,3 +745,95 @@ def test_the_bounds_of_the_unicycle_hold_at_random_points(kind):
     f, V0, V1 = (np.asarray(a, float) for a in jax.vmap(truth)(jnp.asarray(x)))
     for bound, value in ((moved, f), (before, V0), (after, V1), (change, V1 - V0)):
         assert (bound.low <= value + 1e-5).all() and (value <= bound.high + 1e-5).all()
+
+
+class Rules(Rendezvous):
+    """Two points that have to keep apart, and may violate a rule of their own."""
+
+    gap: float = 0.5
+
+    def violations(self, state):
+        return self.crowded(state, self.gap)
+
+
+def steady(state, key):
+    """Nobody moves."""
+    return jnp.zeros((2, 2))
+
+
+def test_safe_counts_rollouts_in_which_a_rule_is_broken():
+    points = dict(agents=2, leaders=(0, 1), dynamics=SingleIntegrator((2.0, 2.0)))
+    few = Safe(rollouts=N, share=0.8)
+    meets = few.check(Rules(**points), lambda s, k: s.goal - s.x, CostSum(Idle()), 0)
+    assert not meets.holds and meets.successes == 0 and meets.worst["failed"]
+    still = few.check(Rules(**points, gap=0.2), steady, CostSum(Idle()), 0)
+    # Two points uniform in a square of side 2 are closer than r with probability pi r^2 / 4, less
+    # what lies outside.
+    assert still.holds and still.successes / N == pytest.approx(1 - 0.0293, abs=0.02)
+    assert "no agent breaks a rule of Rules" in still.claim and "until step 80 (8 s)" in still.claim
+
+
+def test_safe_refuses_a_game_without_a_rule():
+    with pytest.raises(UserError, match="Rendezvous has no rule to break"):
+        Safe().check(POINT, Scripted(), CostSum(Idle()), 0)
+    with pytest.raises(UserError, match="Formation never fire"):
+        Safe().check(Formation(), Scripted(), CostSum(Idle()), 0)
+    result = certified(POINT, Scripted(), {"reach": TABLE["reach"], "safe": Safe()})
+    assert "no rule to break" in result["left_out"]["safe"] and not result["holds"]
+
+
+def test_apart_finds_the_gap_and_tests_it_on_fresh_starts():
+    points = dict(agents=2, leaders=(0, 1), dynamics=SingleIntegrator((2.0, 2.0)))
+    verdict = Apart(rollouts=N, calibration=N, share=0.8).check(
+        Rules(**points), steady, CostSum(Idle()), 0
+    )
+    gap = verdict.figures["gap"]
+    assert verdict.holds and 0.3 < gap < 0.6 and f"closer than {gap:g} m" in verdict.claim
+    meets = Apart(rollouts=N, calibration=N).check(
+        Rules(**points), lambda s, k: s.goal - s.x, CostSum(Idle()), 0
+    )
+    assert not meets.holds and "less than the 0.01 m asked" in meets.claim
+    with pytest.raises(UserError, match="team of one"):
+        Apart().check(POINT, Scripted(), CostSum(Idle()), 0)
+
+
+PATH = Rendezvous(graph="path", dynamics=SingleIntegrator())  # 0 leads, 2 is linked to 1 alone
+PATH_OBS = PATH.observations(PATH.reset(jax.random.key(0))).shape[1]
+
+
+def local(state):
+    """Everybody goes to the mean of itself and its neighbours, the leader to its goal."""
+    x, link = state.x, jnp.asarray(np.eye(3) + PATH.adjacency, jnp.float32)
+    pull = link @ x / jnp.sum(link, axis=1, keepdims=True) - x
+    return pull.at[0].add(state.goal[0] - x[0])
+
+
+@pytest.mark.parametrize(
+    "act, found",
+    [
+        (local, "each agent acts on itself and its neighbours"),
+        (lambda s: local(s) * (1.0 - (s.t > 80)), "agent 0's action changes with the time"),
+        (lambda s: s.goal - s.x, "agent 1's action changes with the target that it is not told"),
+        (lambda s: local(s) + s.goal[1:2], "agent 0's action changes with the target of agent 1"),
+        (lambda s: local(s).at[0].add(s.x[2]), "agent 0's action changes with agent 2, which"),
+    ],
+)  # fmt: skip
+def test_information_is_found_by_test(act, found):
+    said = information(PATH, lambda s, k: act(s), jax.random.key(0))
+    assert said.startswith(found) or said.startswith(f"NOT decentralised: {found}")
+
+
+def test_information_of_policies_and_of_a_verdict():
+    actors = Actors(Shape(3, PATH_OBS, 6, 2, 2), 8, key=jax.random.key(0))
+    alone = Decentralised(Greedy(actors), PATH)
+    assert information(PATH, alone, jax.random.key(0)) == "each agent acts on its own observation"
+
+    class Summed(eqx.Module):
+        def __call__(self, obs, key):
+            return jnp.tanh(jnp.sum(obs, axis=0, keepdims=True)[:, :2]) * jnp.ones((3, 1))
+
+    said = information(PATH, Decentralised(Summed(), PATH), jax.random.key(0))
+    assert said == "NOT decentralised: agent 0's action changes with agent 1's observation"
+    result = certified(POINT, Scripted(leave=jnp.asarray(33)), {"reach": TABLE["reach"]})
+    assert "with the time" in result["information"]
+    assert result["verdicts"]["reach"]["scope"]["information"] == result["information"]

@@ -6,7 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap.controllers import CONTROLLERS, OptimalControl, PointOffset, Replayed
+from marlyap.controllers import (
+    CONTROLLERS,
+    AbstractController,
+    OptimalControl,
+    PointOffset,
+    Replayed,
+    load,
+    names_a_controller,
+)
 from marlyap.dynamics import DoubleIntegrator, LateUnicycle, Unicycle
 from marlyap.errors import UserError
 from marlyap.evaluation import evaluate
@@ -16,7 +24,7 @@ from marlyap.types import State
 
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
-LAWS = [name for name in CONTROLLERS if name != "optimal-control"]
+LAWS = [name for name in CONTROLLERS if name not in ("optimal-control", "zero", "uniform")]
 every_law = pytest.mark.parametrize("name", LAWS)
 PATH = Rendezvous(agents=5, graph="path")
 STRONG = Rendezvous(agents=5, graph="path", dynamics=Unicycle(limits=(1e4, 1e4)))  # unsaturated
@@ -101,10 +109,10 @@ def test_proximity_graphs_leave_a_lonely_agent_at_rest(name):
 
 @every_law
 def test_other_dynamics_are_refused_in_one_sentence(name):
-    with pytest.raises(UserError, match="drives unicycles only"):
+    with pytest.raises(UserError, match="drives Unicycle.* only, not DoubleIntegrator"):
         CONTROLLERS[name](Rendezvous(dynamics=DoubleIntegrator()))
     if name != "tree-pursuit":
-        with pytest.raises(UserError, match="drives unicycles only, not LateUnicycle"):
+        with pytest.raises(UserError, match="drives Unicycle only, not LateUnicycle"):
             CONTROLLERS[name](Rendezvous(dynamics=LateUnicycle()))
 
 
@@ -155,6 +163,76 @@ def test_lin_francis_maggiore_approaches_slowly():
         [0, 40, 600]
     ].mean(axis=(1, 2))
     assert late < 0.25 * start and late < soon < start
+
+
+OWN = """
+from marlyap.controllers import AbstractController, TreePursuit
+from marlyap.game import AbstractGame
+
+class PD(AbstractController):
+    game: AbstractGame
+    gain: float = 2.0
+
+    def __call__(self, state, key):
+        x = state.x
+        return (self.gain * (state.goal - x[:, :2]) - 2.0 * x[:, 2:]) / 5.0
+
+class Unfinished(AbstractController):
+    game: AbstractGame
+
+class Needy(AbstractController):
+    game: AbstractGame
+    other: float
+
+    def __call__(self, state, key):
+        return 0.0 * state.goal
+
+NotOne = 3
+"""
+
+
+def test_a_controller_in_a_file_is_loaded_and_drives_any_dynamics(tmp_path):
+    file = tmp_path / "law.py"
+    file.write_text(OWN)
+    game = Rendezvous(dynamics=DoubleIntegrator(), leaders=(0, 1, 2), horizon=60)
+    assert names_a_controller(f"{file}:PD") and names_a_controller("zero")
+    assert not names_a_controller("runs/demo") and not names_a_controller(str(file))
+    law = load(f"{file}:PD", game)
+    assert isinstance(law, AbstractController) and evaluate(game, law, 20).successes.all()
+    assert type(load("tree-pursuit", PATH)) is CONTROLLERS["tree-pursuit"]
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("tree-persuit", "no controller is called 'tree-persuit'; did you mean 'tree-pursuit'"),
+        ("law.py", "names no class; write .*law.py:Name"),
+        ("law.py:Pd", "defines no controller called 'Pd'; write a class Pd"),
+        ("law.py:NotOne", "defines no controller called 'NotOne'"),
+        ("law.py:Unfinished", "Unfinished cannot be made from a game alone: .*abstract"),
+        ("law.py:Needy", "Needy cannot be made from a game alone: .*"),
+        ("nowhere.py:PD", "there is no file .*nowhere.py"),
+        ("broken.py:PD", "could not be loaded"),
+    ],
+)
+def test_a_controller_that_cannot_be_loaded_is_named(tmp_path, name, says):
+    (tmp_path / "law.py").write_text(OWN)
+    (tmp_path / "broken.py").write_text("1 / 0")
+    word = str(tmp_path / name) if ".py" in name else name
+    with pytest.raises(UserError, match=f"^controller: .*{says}"):
+        load(word, PATH)
+
+
+@pytest.mark.parametrize("dynamics", [DoubleIntegrator(), Unicycle()], ids=["integrator", "uni"])
+def test_zero_and_uniform_actions(dynamics):
+    game = Rendezvous(dynamics=dynamics)
+    state = game.reset(KEY)
+    assert not np.any(act(load("zero", game), state))
+    keys = jax.random.split(KEY, 500)
+    drawn = jax.vmap(lambda k: load("uniform", game)(state, k))(keys)
+    assert drawn.shape == (500, 3, 2) and np.abs(drawn).max() <= 1
+    np.testing.assert_allclose(np.mean(drawn, axis=0), 0, atol=0.15)
+    np.testing.assert_allclose(np.var(drawn, axis=0), 1 / 3, atol=0.08)
 
 
 def test_a_plan_is_replayed_by_the_clock():

@@ -3,6 +3,7 @@
 import argparse
 import csv
 import json
+import platform
 import runpy
 import shutil
 import sys
@@ -69,6 +70,9 @@ def test_the_quick_form(name, script, places, monkeypatch, capsys):
         rate = int(row["successes"]) / int(row["episodes"])
         assert float(row["success_rate"]) == rate and row["episodes"] == "20"
         assert float(row["low"]) <= rate <= float(row["high"])
+        assert 0 <= float(row["at_rest"]) <= 1 and 0 <= float(row["stayed"]) <= 1
+        assert float(row["speed"]) >= 0 and float(row["spin"]) >= 0
+        assert len(row["policy"]) == 64 and row["machine"] == platform.machine()
     contraction = table(places, f"{name}-rendezvous-contraction")
     assert len(contraction) == cases * 2
     for row in contraction:  # 98 % of 20 starts are all of them
@@ -127,6 +131,34 @@ def test_the_published_tables_are_read(script, places, tmp_path, capsys):
     script("headline", "--draw", **{"--results": tmp_path})
     said = capsys.readouterr().out
     assert "success within 0.1 m" in said and "masac-lyapunov" in said and "P(" in said
+
+
+def test_one_seed_is_enough_for_a_table(script, tmp_path, capsys):
+    """Without an interval over seeds, and without a probability of improvement."""
+    for path in (PLACE / "results").glob("headline-rendezvous-*.csv"):
+        with path.open(newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row["seed"] == "0"]
+        with (tmp_path / path.name).open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+    script("headline", "--draw", **{"--results": tmp_path})
+    said = capsys.readouterr().out
+    assert "P(masac-lyapunov above masac) needs two seeds or more of each" in said
+    assert "success within 0.1 m" in said and "P(masac-lyapunov above masac) =" not in said
+
+
+def test_the_mean_of_a_table_has_an_interval_that_holds(script, tmp_path, capsys, monkeypatch):
+    """Beside the bootstrap's: for the expectation over training seeds, of shares alone."""
+    monkeypatch.syspath_prepend(str(PLACE))
+    from common import estimate
+
+    from marlyap.statistics import mean_interval
+
+    rows = [{"success_rate": r, "successes": str(int(10 * r)), "episodes": "10"} for r in (0.5, 1)]
+    assert estimate(rows).expected == mean_interval([0.5, 1.0])
+    assert estimate(rows[:1]).expected is None
+    assert estimate([{"success_rate": r, "successes": ""} for r in (-0.1, 0.5)]).expected is None
 
 
 @every_script

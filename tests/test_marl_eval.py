@@ -88,3 +88,29 @@ def test_from_runs(tmp_path):
             }
         }
     }
+
+
+def measured_run(place, seed, rule, rate, starts=0):
+    trainer = Trainer(Rendezvous(), rule, dataclasses.replace(Schedule(), steps=10))
+    names = {"task": "rendezvous", "algorithm": "masac", "preset": "tuned"}
+    run = Run.create(place, trainer, seed, names)
+    run.log({"iteration": 2, "steps": 10, "return": -8.0, "success": 0.25})
+    end = {"success_rate": rate, "return_mean": -7.0, "start_seed": starts, "episodes": 500}
+    (place / "evaluation.json").write_text(json.dumps(end))
+    return place
+
+
+def test_settings_of_one_algorithm_are_told_apart(tmp_path):
+    plain = [measured_run(tmp_path / f"a{s}", s, MASAC(), 0.5) for s in (0, 1)]
+    other = measured_run(tmp_path / "b", 0, MASAC(rate_Q=1e-4), 0.75)
+    found = from_runs([*plain, other])["marlyap"]["rendezvous"]
+    assert {name: len(seeds) for name, seeds in found.items()} == {
+        f"masac (rate_Q={MASAC().rate_Q:g})": 2,
+        "masac (rate_Q=0.0001)": 1,
+    }
+    again = measured_run(tmp_path / "c", 0, MASAC(), 0.9)
+    with pytest.raises(UserError, match="masac seed 0 on rendezvous is there twice"):
+        from_runs([*plain, again])
+    elsewhere = measured_run(tmp_path / "d", 2, MASAC(), 0.9, starts=7)
+    with pytest.raises(UserError, match="same starts"):
+        from_runs([*plain, elsewhere])

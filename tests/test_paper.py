@@ -650,6 +650,26 @@ def test_hinge_imitates_only_what_made_L_fall(function, certificate, batch, draw
     assert not any(np.any(np.asarray(x)) for x in jax.tree.leaves(nxt))
 
 
+@pytest.mark.parametrize("reading", ["literal", "hinge"])
+def test_the_weight_follows_the_batch_mean_without_the_margin(reading, certificate, batch, drawn):
+    """It falls where the mean rise is negative, though states rise and the penalty is positive."""
+    L = certificate["squares"]
+    pairs = zip(rows(batch), rows(drawn[1]), strict=True)
+    rises = np.array([rise_of(L.net.value, b, x.action) for b, x in pairs])
+    lower = rises.mean() + 0.05  # what the rises fall by when the costs do by ten times as much
+    cheaper = eqx.tree_at(lambda b: b.cost, batch, batch.cost - lower / 0.1)
+    assert np.any(rises - lower > 0)
+    found = set()
+    for slope in (0.0, 50.0):
+        constraint = Lyapunov(reading=reading, slope=slope, weight=None)
+        after, info = eqx.filter_jit(constraint.update)(L, cheaper, *drawn, jnp.ones(()))
+        assert info["rise"] == pytest.approx(-0.05, abs=1e-3)
+        assert after.log_weight.value < L.log_weight.value
+        found.add(float(after.log_weight.value))
+    assert len(found) == 1
+    assert np.mean(penalties(constraint, L, cheaper, *drawn)) > 0.1
+
+
 def test_score_raises_the_likelihood_of_good_actions(learner, certificate, batch, noise, drawn):
     constraint = Lyapunov(reading="score", function="norm", weight=1.0)
     L, pi = certificate["norm"], learner.pi.value

@@ -73,16 +73,23 @@ def trained(seed: int, algorithm: str = "masac-lyapunov", rate: float = 0.96) ->
     return {
         "name": f"{algorithm}-{seed}",
         "label": f"{algorithm}, seed {seed}",
-        "algorithm": algorithm,
+        "group": algorithm,
         "seed": seed,
         "episodes": 500,
         "successes": round(500 * rate),
         "success_rate": rate,
         "interval": [rate - 0.02, min(rate + 0.015, 1.0)],
         "radii": [
-            {"radius": r, "rate": p, "interval": [p - 0.03, min(p + 0.03, 1)]} for r, p in radii
+            {"radius": r, "success_rate": p, "interval": [p - 0.03, min(p + 0.03, 1)]}
+            for r, p in radii
         ],
+        "at_rest": {"success_rate": 0.125},
+        "stayed": {"success_rate": 0.875},
+        "beyond_steps": 360,
         "final_distance": {"0.5": 0.031, "0.95": 0.094, "1.0": 0.4},
+        "final_speed": {"0.5": 0.11, "0.95": 0.21, "1.0": 0.3},
+        "final_spin": {"0.5": 4.25, "0.95": 6.0, "1.0": 6.5},
+        "rests": "circles inside the ball (median 0.11 m/s, 4.2 rad/s)",
         "settling_time": {"0.5": 1.9, "0.95": 3.4},
         "return_mean": -18.3 - seed,
         "log": [
@@ -90,6 +97,25 @@ def trained(seed: int, algorithm: str = "masac-lyapunov", rate: float = 0.96) ->
             for s, p in zip(steps, success, strict=True)
         ],
     }
+
+
+def team(name: str = "rendezvous masac-lyapunov", **others) -> dict:
+    """Five training seeds of one configuration."""
+    return {
+        "label": name,
+        "about": "mean over 5 training seeds",
+        "success_rate": 0.9604,
+        "interval": [0.7118, 0.9979],
+        "episodes": 2500,
+        "successes": 2401,
+        "seeds": [0, 1, 2, 3, 4],
+        "radius": 0.1,
+        "at_rest": {"success_rate": 0.183},
+        "stayed": {"success_rate": 0.9},
+        "beyond_steps": 360,
+        "rests": "circles inside the ball (median 0.11 m/s, 4.2 rad/s)",
+        "text": "Measured on sampled starts; the decrease of L was sampled too, not proved.",
+    } | others
 
 
 def full_page() -> dict:
@@ -103,15 +129,8 @@ def full_page() -> dict:
         "title": "Rendezvous: three unicycles, one leader",
         "subtitle": "MASAC with the Lyapunov constraint, complete graph; one robot is told.",
         "generated": "21 November 2026",
-        "summary": {
-            "success_rate": 0.9604,
-            "interval": [0.9518, 0.9679],
-            "episodes": 2500,
-            "successes": 2401,
-            "seeds": 5,
-            "radius": 0.1,
-            "text": "Measured on sampled starts; the decrease of L was sampled too, not proved.",
-        },
+        "starts": 7,
+        "groups": [team()],
         "runs": [trained(seed, rate=0.972 - 0.006 * seed) for seed in range(5)],
         "films": films,
         "comparisons": [
@@ -126,11 +145,30 @@ def full_page() -> dict:
         ],
         "certificates": [
             {
-                "claim": "L decreases along the closed loop",
-                "evidence": "20 000 sampled states",
-                "bound": 0.013,
+                "name": "reach",
+                "run": "seed 0",
+                "claim": "every agent is within 0.1 m of its goal at 4 s",
+                "evidence": "statistical",
+                "holds": False,
+                "asked": 0.98,
+                "bound": 0.95229,
+                "shown": "95.22 %",
                 "confidence": 0.95,
                 "text": "sampled",
+            }
+        ],
+        "notes": ["runs/a: log.jsonl is cut off"],
+        "changed": ["algorithm.constraint.beta"],
+        "differing": [{"name": "masac-lyapunov", "fields": "constraint.beta=0.5"}],
+        "training": [
+            {
+                "name": "seed 0",
+                "command": "marlyap train rendezvous masac-lyapunov --seeds 0 1 2 3 4 --out runs",
+                "made": "2026-11-21T10:00:00Z",
+                "seed": 0,
+                "seconds": 161.4,
+                "policy": "0123456789ab",
+                "versions": {"jax": "0.10.2", "machine": "x86_64"},
             }
         ],
         "config": {
@@ -153,8 +191,7 @@ def full_page() -> dict:
             "environments": 64,
         },
         "versions": {"marlyap": "0.1.0", "jax": "0.10.2", "python": "3.11.2"},
-        "command": "marlyap train rendezvous masac-lyapunov --seeds 0 1 2 3 4 --out runs/demo",
-        "wall_time_s": 161.4,
+        "command": "marlyap report runs/demo",
     }
 
 
@@ -185,22 +222,90 @@ def test_policy_allows_only_the_player(text):
     assert policy.startswith("default-src 'none'") and f"script-src 'sha256-{digest}'" in policy
 
 
+def said(text: str) -> str:
+    """The words of the page, without its style and its player."""
+    body = text.split("<body>")[1].split('<script type="application/json"')[0]
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", body.replace("\u202f", "")))
+
+
 def test_says_what_matters(text):
-    words = re.sub(r"\s+", " ", re.sub(r"<[^>]*>", "", text.replace("\u202f", "")))
+    words = said(text)
     for fact in (
         "96.0 %",
-        "95.2 – 96.8 %",
+        "mean over 5 training seeds; 95 % interval 71.2 – 99.8 % for the expectation over",
         "2401 of 2500 episodes",
-        "5 training seeds",
+        "held-out starts of seed 7",
+        "circles inside the ball (median 0.11 m/s, 4.2 rad/s)",
+        "at rest at the last step: 18.3 %; stays for 360 steps more: 90.0 %",
         "not proved",
         "0.0053",
         "algorithm.constraint.beta",
         "2 min 41 s",
+        "0123456789ab",
+        "machine x86_64",
+        "4.25 / 6.00",
         "within 0.15 m",
         "environment steps",
+        "runs/a: log.jsonl is cut off",
+        "asked 98.0 % shown 95.22 %",
+        "reach · seed 0 not reached",
     ):
         assert fact in words, fact
     assert words.count("start 12") == 2  # on its button and under its picture
+    places = [words.index(w) for w in ("marlyap train", "This report", "marlyap report runs")]
+    assert places == sorted(places)
+
+
+def test_several_configurations_have_no_figure_in_common():
+    page = full_page()
+    one = {"about": "this policy", "success_rate": 0.5, "interval": [0.4, 0.6], "seeds": [3]}
+    page["groups"] = [team("weight=0.1"), team("weight=1", **one)]
+    text = report.html(page)
+    words = said(text)
+    assert 'class="verdict"' not in text and text.count("<article><h3>weight=") == 2
+    assert "exact 95 % interval 40.0 – 60.0 % of this policy" in words
+    assert text.count('class="pooled"') == 1  # the mean over the seeds of the first alone
+
+
+@pytest.mark.parametrize(
+    ("claim", "badge", "shows"),
+    [
+        ({"holds": True, "asked": 0.95, "bound": 0.96}, "reached", "shown 96.0 %"),
+        (
+            {"holds": False, "asked": 0.95, "bound": 0.9499, "shown": "94.99 %"},
+            "not reached",
+            "shown 94.99 %",
+        ),
+        ({"holds": False, "asked": 0.95, "bound": 0.96}, "does not hold", "bound 0.96"),
+        ({"holds": True, "bound": 0.5}, "holds", "bound 0.5"),
+        ({"holds": False}, "does not hold", "reach"),
+    ],
+)
+def test_a_claim_says_what_was_asked_and_shown(claim, badge, shows):
+    page = {"title": "t", "certificates": [{"name": "reach", "claim": "c"} | claim]}
+    words = said(report.html(page))
+    assert f"reach {badge} c" in words and shows in words
+
+
+def test_the_level_that_was_certified_is_spoken_of_where_it_is_drawn():
+    ring = [[0.0, 0.1], [0.1, 0.0], [0.0, 0.1]]
+    part = {"label": "agent 0", "reach": 1.0, "radius": 0.1, "headings": False}
+    for certified in (False, True):
+        lines = [{"level": 1.0, "lines": [ring], "certified": certified}]
+        page = {"title": "t", "certificates": [{"name": "basin"}], "slices": [part]}
+        page["slices"] = [part | {"contours": lines}]
+        words = said(report.html(page))
+        assert ("dashed" in words) == certified and "facing right" not in words
+
+
+def test_what_rises_is_named_after_its_function():
+    films = [rollout(1), rollout(1) | {"function": "V"}, rollout(1) | {"lyapunov": None}]
+    made = embedded(report.html({"title": "t", "films": films}))
+    assert [(f["levelName"], f["rises"]) for f in made] == [
+        ("L", True),
+        ("V", True),
+        ("cost", False),
+    ]
 
 
 def test_is_pure():
@@ -214,20 +319,27 @@ def test_hostile_text_is_harmless():
     page = full_page()
     for key in ("title", "subtitle", "generated", "command"):
         page[key] = HOSTILE
-    page["summary"]["text"] = HOSTILE
+    page["groups"] = [team(HOSTILE, **dict.fromkeys(("about", "rests", "text"), HOSTILE))]
+    page["notes"] = [HOSTILE]
+    page["training"][0] = dict.fromkeys(("name", "command", "made", "policy"), HOSTILE)
+    page["training"][0]["versions"] = {HOSTILE: HOSTILE}
+    page["differing"] = [{"name": HOSTILE, "fields": HOSTILE}]
     page["config"] = {HOSTILE: {HOSTILE: HOSTILE}}
     page["versions"] = {HOSTILE: HOSTILE}
     for run in page["runs"]:
-        run["label"] = run["algorithm"] = HOSTILE
+        run["label"] = run["group"] = HOSTILE
     for film in page["films"]:
         film["label"] = film["run"] = film["start"] = HOSTILE
     page["films"][0]["run"] = "another"
-    page["runs"][0]["algorithm"] = "another"
+    page["runs"][0]["group"] = "another"
     page["comparisons"][0] = dict.fromkeys(("a", "b", "text"), HOSTILE)
     page["certificates"][0] = dict.fromkeys(
-        ("claim", "evidence", "bound", "confidence", "text"), HOSTILE
+        ("name", "run", "claim", "evidence", "bound", "confidence", "text"), HOSTILE
     )
+    page["certificates"].append({"run": "another"})
     text = report.html(page)
+    page["groups"] *= 2
+    assert "<img" not in report.html(page)
     assert "<img" not in text and text.count("</script>") == 2 and text.count("<script") == 2
     assert embedded(text)[0]["label"] == HOSTILE
 
@@ -245,18 +357,19 @@ def test_embedded_data_is_what_was_given(text):
 def test_missing_numbers_are_dashes(kind):
     missing = {"nan": float("nan"), "none": None, "inf": float("inf")}[kind]
     page = full_page()
-    page["summary"].update(interval=[missing, missing], seeds=missing)
+    page["groups"][0].update(interval=[missing, missing], successes=missing, radius=missing)
+    page["groups"][0].update(at_rest={"success_rate": missing})
     page["runs"][0].update(
         success_rate=missing,
         interval=missing if kind == "none" else [missing, 1],
         return_mean=missing,
         episodes=missing,
     )
-    page["runs"][0]["radii"][1].update(rate=missing)
+    page["runs"][0]["radii"][1].update(success_rate=missing)
     page["runs"][0]["log"][3].update({"return": missing, "success": missing})
     page["runs"][0]["final_distance"] = {"0.5": missing}
     page["config"]["steps"] = missing
-    page["wall_time_s"] = missing
+    page["training"][0]["seconds"] = missing
     film = page["films"][0]
     film["positions"] = film["positions"].tolist()
     film["positions"][7][1] = [missing, missing]
@@ -298,7 +411,10 @@ def test_any_key_of_a_film_may_be_missing(key):
 def test_empty_parts():
     page = {
         "title": "",
-        "summary": {},
+        "groups": [{}],
+        "notes": [],
+        "training": [{}],
+        "differing": [{}],
         "runs": [{}],
         "films": [{"positions": []}, {"positions": [[[0, 0]]]}],
         "comparisons": [{}],
@@ -327,18 +443,11 @@ def test_point_masses_and_constant_edges():
     assert made["levelName"] == "cost"
 
 
-def test_several_algorithms_have_a_colour_each():
+def test_several_groups_have_a_colour_each():
     page = full_page()
     page["runs"] = [trained(s, a) for a in ("masac", "masac-lyapunov") for s in range(2)]
     assert report._colours(page["runs"]) == [0, 0, 1, 1]
     report.html(page)
-
-
-def test_pooled_row_only_when_the_summary_is_of_all_runs(text):
-    assert 'class="pooled"' in text
-    page = full_page()
-    page["summary"]["episodes"] = 500
-    assert 'class="pooled"' not in report.html(page)
 
 
 def test_mean_curve_ignores_gaps_and_shorter_runs():

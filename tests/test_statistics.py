@@ -14,6 +14,9 @@ from marlyap.statistics import (
     iqm,
     lower_bound,
     mcnemar,
+    mean_bound,
+    mean_covered,
+    mean_interval,
     probability_of_improvement,
     quantile_upper_bound,
     stratified_bootstrap,
@@ -224,6 +227,9 @@ def test_bad_fractions(bad):
         lambda: trials_needed(0.1, bad),
         lambda: bonferroni(bad, 2),
         lambda: quantile_upper_bound(pair, 0.5, bad),
+        lambda: mean_interval([0.5], bad),
+        lambda: mean_bound([0.5], bad),
+        lambda: mean_covered([0.5], 0.5, bad),
         lambda: stratified_bootstrap(pair[:, None], confidence=bad),
         lambda: two_level_bootstrap([pair, pair], confidence=bad),
         lambda: probability_of_improvement(pair, pair, confidence=bad),
@@ -279,6 +285,64 @@ def test_mcnemar_matches_scipy():
 def test_mcnemar_bad_input(a, b, says):
     with pytest.raises(UserError, match=says):
         mcnemar(a, b)
+
+
+# The mean of bounded values.
+
+
+def test_the_mean_interval_is_clopper_pearson_for_zeros_and_ones():
+    for confidence in (0.5, 0.95, 0.999):
+        for k, n in [(0, 1), (1, 1), (2, 3), (5, 5), (0, 7), (9, 10), (13, 40), (199, 200)]:
+            values = np.r_[np.ones(k), np.zeros(n - k)]
+            expected = clopper_pearson(k, n, confidence)
+            assert mean_interval(values, confidence) == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_mean_bound_is_the_quantile_of_randomly_weighted_values():
+    rng = np.random.default_rng(13)
+    for values in ([0.3], [0.2, 0.2, 0.9], rng.uniform(size=10), np.r_[np.ones(6), 0.5, 0.96]):
+        weights = rng.dirichlet(np.ones(len(values) + 1), size=200_000)
+        drawn = weights @ np.append(np.sort(values), 1.0)
+        for confidence in (0.6, 0.975):
+            bound = mean_bound(values, confidence)
+            assert np.mean(drawn <= bound) == pytest.approx(confidence, abs=0.005)
+            assert mean_covered(values, bound - 1e-6, confidence)
+            assert not mean_covered(values, bound + 1e-6, confidence)
+
+
+def test_the_mean_interval_of_one_value_is_markovs():
+    for x in (0.0, 0.4, 1.0):
+        assert mean_interval([x]) == pytest.approx((0.025 * x, 1 - 0.025 * (1 - x)))
+
+
+def test_the_mean_interval_holds_the_mean_and_turns_with_its_values():
+    rng = np.random.default_rng(14)
+    for n in (1, 2, 5, 30, 300):
+        values = rng.beta(5, 1, size=n)
+        low, high = mean_interval(values)
+        assert 0 <= low < values.mean() < high <= 1
+        assert mean_interval(1 - values) == pytest.approx((1 - high, 1 - low))
+        wide = mean_interval(values, 0.999)
+        assert wide.low < low and high < wide.high
+    assert mean_interval(np.ones(3)) == pytest.approx((0.025 ** (1 / 3), 1.0))
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ([], "at least 1"),
+        ([[0.5]], "1 dimension"),
+        ([1.1], "between 0 and 1"),
+        ([-0.1, 0.5], "between 0 and 1"),
+        ([math.nan], "finite"),
+        (["a"], "real numbers"),
+    ],
+)
+def test_mean_interval_bad_input(values, says):
+    with pytest.raises(UserError, match=says):
+        mean_interval(values)
+    with pytest.raises(UserError, match=says):
+        mean_bound(values, 0.9)
 
 
 # Scores.

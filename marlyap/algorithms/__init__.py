@@ -1,4 +1,4 @@
-"""The algorithms that can be asked for by name, each in two settings.
+"""The algorithms that have a name, each in two settings.
 
 `tuned` is what learns best here; `paper` is section 4 of the paper to the letter, and for the
 references, which the paper does not have, the same networks and numbers.

@@ -34,7 +34,7 @@ from marlyap.types import Key, Scalar
 
 class Learner(eqx.Module):
     pi: Learnt[Actors]
-    pi_mean: Actors  # running mean of pi: the policy that is handed out
+    pi_mean: Actors  # running mean of pi: the policy that is deployed
 
 
 class APG(AbstractModelBased):
@@ -43,12 +43,12 @@ class APG(AbstractModelBased):
     rate_pi: float = 2e-3  # learning rate
     actor_width: int = 64  # units in each of two hidden layers
     shared: bool = False  # one set of actor weights for all agents
-    sharpness: float = 0.5  # what it costs to be outside the ball, beside the distance (m)
+    sharpness: float = 0.5  # extra cost of being outside the ball, beside the distance (m)
     clip: float = 1.0  # largest norm of a gradient
-    average: float = 1e-2  # how fast the policy handed out follows the actor; 1 is the actor itself
+    average: float = 1e-2  # how fast the deployed policy follows the actor; 1 is the actor itself
     weight: float = 0.0  # of the decrease condition
-    T: int = 20  # steps over which the cost has to fall ...
-    decrease: float = 0.1  # ... by this share
+    T: int = 20  # steps over which the cost has to fall
+    decrease: float = 0.1  # share by which the cost has to fall over T steps
 
     def __check_init__(self):
         within("rate_pi", self.rate_pi, 0, 1)
@@ -88,7 +88,7 @@ class APG(AbstractModelBased):
         return jnp.mean(jnp.where(now >= game.radius, delta, 0.0))
 
     def improve(self, learner, game, keys, decay):
-        """phi <- phi - rate grad J, the gradient no longer than `clip`; one not finite is zero."""
+        """phi <- phi - rate grad J, clipped to norm `clip`; entries not finite count as 0."""
         l = learner
 
         @eqx.filter_value_and_grad(has_aux=True)

@@ -9,8 +9,8 @@
     sigma-tilde, c              smoothing, smoothing_clip              the same, 5.3
     d                           delay                                  the same, 5.2
 
-What is not the rule itself (networks, normalisation, heads, averaged policy) is that of `MASAC`,
-so that the two can be compared. Two things differ from Lowe et al.: each agent improves the mean of
+Networks, normalisation, heads and averaged policy are those of `MASAC`, so that the two can be
+compared. Two things differ from Lowe et al.: each agent improves the mean of
 all agents' values and not its own alone, for the game is cooperative; and in that step the other
 agents' actions come from their current policies and not from the memory.
 """
@@ -32,7 +32,7 @@ from marlyap.types import Action, Scalar, Transition
 class Learner(eqx.Module):
     pi: Learnt[Actors]
     pi_bar: Actors
-    pi_mean: Actors  # running mean of pi: the policy that is handed out
+    pi_mean: Actors  # running mean of pi: the policy that is deployed
     Q: Learnt[Critic]
     Q_bar: Critic
     updates: Int[Array, ""]
@@ -45,7 +45,7 @@ class MADDPG(AbstractOffPolicy):
     tau: float = 0.005  # how fast the targets follow
     rate_pi: float = 3e-4  # actor learning rate
     rate_Q: float = 3e-3  # critic learning rate
-    noise: float = 0.1  # standard deviation of what is added to actions in play
+    noise: float = 0.1  # standard deviation of the exploration noise
     batch: int = 256  # transitions per update
     n_step: int = 1  # steps summed in the critic's target
     reward_scale: float = 2.0  # factor on the reward
@@ -54,10 +54,10 @@ class MADDPG(AbstractOffPolicy):
     normalise: bool = True  # LayerNorm in the critics
     heads: Literal["team", "agent"] = "agent"  # a value for the team, or one for each agent's cost
     shared: bool = False  # one set of actor weights for all agents
-    average: float = 1e-3  # how fast the policy handed out follows the actor; 1 is the actor itself
+    average: float = 1e-3  # how fast the deployed policy follows the actor; 1 is the actor itself
     critics: int = 1  # with 2 the smaller value is the target
-    smoothing: float = 0.0  # standard deviation of what is added to the target's actions
-    smoothing_clip: float = 0.5  # and the most of it
+    smoothing: float = 0.0  # standard deviation of the noise on the target's actions
+    smoothing_clip: float = 0.5  # largest noise on the target's actions
     delay: int = 1  # critic updates for one of the actors and targets
 
     def __check_init__(self):

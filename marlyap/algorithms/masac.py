@@ -16,7 +16,7 @@
 Numbers count the paper's displayed equations: (1)-(4) values and Bellman operator, (5) joint
 entropy, (6)-(8) J_Q, its gradient and delta_Q, (9)-(11) policy improvement, (12) temperature,
 (13) Theorem 1, (14) the objective with Delta L. Where the printed equation is wrong the method
-says what was mended.
+says what was corrected.
 """
 
 from typing import Literal
@@ -37,7 +37,7 @@ from marlyap.types import Scalar, Transition
 
 class Learner(eqx.Module):
     pi: Learnt[Actors]
-    pi_mean: Actors  # running mean of pi: the policy that is handed out
+    pi_mean: Actors  # running mean of pi: the policy that is deployed
     Q: Learnt[Critic | MeanFieldCritic]
     Q_bar: Critic | MeanFieldCritic
     log_alpha: Learnt[Scalar]
@@ -55,7 +55,7 @@ class MASAC(AbstractOffPolicy):
     alpha: float = 0.1  # temperature to begin with
     entropy: float = -2.0  # target entropy per agent (nats)
     batch: int = 256  # transitions per update
-    n_step: int = 1  # steps summed in the critic's target
+    n_step: int = 1  # steps summed in the critic's target, without the entropies between
     reward_scale: float = 2.0  # factor on the reward
     actor_width: int = 64  # units in each of two hidden layers
     critic_width: int = 64  # units in each of two hidden layers
@@ -63,8 +63,8 @@ class MASAC(AbstractOffPolicy):
     heads: Literal["team", "agent"] = "agent"  # a value for the team, or one for each agent's cost
     shared: bool = False  # one set of actor weights for all agents
     critic: Literal["joint", "mean-field"] = "joint"  # of everyone, or of one and the others' mean
-    average: float = 1e-3  # how fast the policy handed out follows the actor; 1 is the actor itself
-    keep_Q: bool = True  # False drops Q from the policy objective (Han et al. 2020)
+    average: float = 1e-3  # how fast the deployed policy follows the actor; 1 is the actor itself
+    keep_Q: bool = True  # false drops Q from the policy objective (Han et al. 2020)
     constraint: AbstractConstraint = Unconstrained()  # the Lyapunov condition, if any
 
     def __check_init__(self):
@@ -101,7 +101,8 @@ class MASAC(AbstractOffPolicy):
         """Eq. (6), the soft Bellman residual of both critics.
 
         The printed target adds the entropy to a V that already has it; here it enters once,
-        at s_{t+1}, with the smaller target twin.
+        at s_{t+1}, with the smaller target twin. With n_step > 1 the entropies of the steps between
+        are left out, so the backup is biased.
         """
         alpha = jnp.exp(l.log_alpha.value)
         Q_next = jnp.min(l.Q_bar(b.next_features, nxt.action), axis=0)

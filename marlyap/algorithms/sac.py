@@ -1,6 +1,6 @@
 """Soft actor-critic at the two ends of what agents may know: each alone, and all as one.
 
-Both are `MASAC` with the same networks and numbers, and differ only in what it is shown.
+Both are `MASAC` with the same networks and hyperparameters; only its inputs differ.
 """
 
 import dataclasses
@@ -55,7 +55,7 @@ class DecentralisedSAC(MASAC):
 
 
 def alone(b: Transition, i: Int[Array, ""]) -> Transition:
-    """One transition as agent i has it: a game of one agent, in which all there is it observes."""
+    """One transition as agent i has it: a game of one agent, whose state is what it observes."""
     own = {f.name: getattr(b, f.name) for f in dataclasses.fields(b) if f.name != "discount"}
     own |= {"features": b.obs, "next_features": b.next_obs}
     return Transition(**{k: x[i][None] for k, x in own.items()}, discount=b.discount)
@@ -69,14 +69,14 @@ def team(actors: Actors) -> Actors:
 class CentralisedSAC(MASAC):
     """One policy over what all agents observe together: centralised, a bound on what can be learnt.
 
-    Each agent's network sees the observations of all. What it hands out is no decentralised
+    Each agent's network sees the observations of all. Its policy is not a decentralised
     controller, though it is rolled out and evaluated like one.
     """
 
     def __check_init__(self):
         if self.shared:
             raise UserError(
-                "shared: agents that all see the same must not act the same; set false."
+                "shared: agents with equal inputs and weights all act alike; set it to false."
             )
 
     def init(self, shape, key):

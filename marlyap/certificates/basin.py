@@ -1,5 +1,6 @@
 """C4: the largest level set of V from which no rollout failed, confirmed on fresh starts."""
 
+import dataclasses
 from typing import ClassVar
 
 import numpy as np
@@ -8,15 +9,33 @@ from marlyap.certificate import (
     AbstractCertificate,
     Evidence,
     Judgement,
-    Verdict,
-    at_least,
+    arrival,
     judged,
-    scope,
-    worst_of,
+    no_lyapunov,
+    of_share,
+    percent,
+    until_step,
 )
 from marlyap.certificates.reach import ReachAndStay
 from marlyap.rollout import until
 from marlyap.statistics import bonferroni, clopper_pearson, trials_needed
+
+
+def claim(
+    bound: float,
+    V: str,
+    level: float,
+    arrived: str,
+    horizon: int,
+    stay: int,
+    dt: float,
+    mass: float,
+) -> str:
+    return (
+        f"at least {percent(bound)} of the starts with V <= {level:.4g} have {arrived} at every "
+        f"step from {horizon * dt:g} s {until_step(horizon + stay, dt)}, and at least "
+        f"{percent(mass)} of all starts are such, with V {V}"
+    )
 
 
 class Basin(AbstractCertificate):
@@ -40,33 +59,41 @@ class Basin(AbstractCertificate):
     def check(self, game, controller, V, seed):
         steps, n = game.horizon + max(self.stay, V.beyond), self.rollouts
         each = bonferroni(self.confidence, 2)
-        first = judged(self.judge, game, controller, V, seed, "calibrate", self.calibration, steps)
+        draw = lambda purpose, count: judged(
+            self.judge, game, controller, V, seed, purpose, count, steps, True
+        )
+        first, found = draw("calibrate", self.calibration), draw("certify", n)
         level = largest_level(first.figures["V"], first.holds)
-        found = judged(self.judge, game, controller, V, seed, "certify", n, steps)
-        inside = found.figures["V"] <= level
-        m, k = int(inside.sum()), int((found.holds & inside).sum())
-        bound, shown = at_least(k, m, self.share, each)
+        found = dataclasses.replace(found, asked=found.figures["V"] <= level)
+        m = int(found.asked.sum())
         mass = clopper_pearson(m, n, each)
-        needed = trials_needed(1 - self.share, each)
-        return Verdict(
+        say = lambda bound: claim(
+            bound,
+            V.meaning,
+            level,
+            arrival(game),
+            game.horizon,
+            self.stay,
+            game.dt,
+            float(mass.low),
+        )
+        return of_share(
+            self,
+            game,
+            V,
+            seed,
+            found,
+            game.horizon + self.stay,
+            say,
             name="basin",
-            claim=f"from at least a share {bound:.4f} of the starts with V <= {level:.4g} every "
-            f"agent is within {game.radius:g} m from {game.horizon * game.dt:g} s and stays for "
-            f"{self.stay * game.dt:g} s; they are at least a share {mass.low:.4f} of the starts",
-            evidence=self.evidence,
-            holds=shown,
-            bound=bound,
-            confidence=self.confidence,
-            scope=scope(game, game.horizon + self.stay) | {"starts_with": f"V <= {level:.6g}"},
-            trials=m,
-            successes=k,
-            worst=worst_of(game, seed, "certify", found, inside) if m else None,
+            confidence=each,
+            void=no_lyapunov(V, first, found),
+            to_judge=f"begin with V <= {level:.4g}, below the least V of a failure",
+            scope={"starts_with": f"V <= {level:.6g}"},
             figures={
                 "level": level,
                 "mass": [mass.low, mass.high],
-                "drawn": n,
-                "needed_inside": needed,
-                "share_asked": self.share,
+                "needed_inside": trials_needed(1 - self.share, each),
                 "stay_steps": self.stay,
                 "V": type(V).__name__,
                 "failures_calibrating": int((~first.holds).sum()),

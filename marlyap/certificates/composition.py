@@ -1,5 +1,7 @@
 """C7: a team's certificate put together from one function per agent; the route to many agents."""
 
+import dataclasses
+import math
 from typing import ClassVar
 
 import equinox as eqx
@@ -13,12 +15,21 @@ from marlyap.certificate import (
     AbstractCertificate,
     Evidence,
     Judgement,
-    Verdict,
     enough,
     judged,
-    share_of,
+    of_share,
+    percent,
+    until_step,
 )
 from marlyap.game import AbstractGame
+
+
+def claim(bound: float, rho: float, farthest: float, steps: int, dt: float) -> str:
+    return (
+        f"at least {percent(bound)} of starts obey the fitted inequalities between neighbours "
+        f"(spectral radius {rho:.3f}) {until_step(steps, dt)}; they pull every distance towards "
+        f"at most {farthest:.3g} m as long as they are obeyed, and nothing is said of later steps"
+    )
 
 
 class Composition(AbstractCertificate):
@@ -58,24 +69,34 @@ class Composition(AbstractCertificate):
         rho = float(np.max(np.abs(np.linalg.eigvals(M)))) if np.isfinite(M).all() else np.inf
         found = draw("certify", self.rollouts)
         excess = worst_excess(found.figures["V"], M, delta, self.T)
-        found = type(found)(found.holds & (excess <= 0), excess, {"excess": excess})
-        bound, shown, fields = share_of(self, game, seed, found, steps)
+        above = np.any(found.figures["V"][:, 0] > ultimate[None], axis=1)
+        found = dataclasses.replace(
+            found,
+            holds=found.holds & (excess <= 0),
+            badness=excess,
+            figures={"excess": excess},
+        )
         farthest = float(np.max(ultimate))
         within = game.radius if self.within is None else self.within
-        return Verdict(
+        say = lambda bound: claim(bound, rho, farthest, steps, game.dt)
+        return of_share(
+            self,
+            game,
+            V,
+            seed,
+            found,
+            steps,
+            say,
             name="composition",
-            claim=f"along at least a share {bound:.4f} of the rollouts the agents' functions obey "
-            f"inequalities with spectral radius {rho:.3f}, by which all distances would end "
-            f"below {farthest:.3g} m",
-            **fields,
-            holds=bool(shown and rho < 1 and farthest <= within),
+            void=nothing_contracted(rho, farthest, int(above.sum()), len(above)),
+            also=farthest <= within,
             figures={
                 "rho": rho,
                 "M": M.tolist(),
                 "delta": delta.tolist(),
                 "ultimate": ultimate.tolist(),
+                "begin_above": int(above.sum()),
                 "T": self.T,
-                "share_asked": self.share,
             },
         )
 
@@ -94,12 +115,24 @@ class Composition(AbstractCertificate):
                 rows = [fit_row(linked, values, self.T, i, weight) for i in range(N)]
                 M = np.stack([row for row, _ in rows])
                 delta = np.array([(1 + self.slack) * d for _, d in rows]) + 1e-6
-                if np.max(np.abs(np.linalg.eigvals(M))) >= 1 - 1e-6:
+                if not M.any() or np.max(np.abs(np.linalg.eigvals(M))) >= 1 - 1e-6:
                     continue
                 ultimate = np.linalg.solve(np.eye(N) - M, delta)
                 if np.max(ultimate) < np.max(best[2]):
                     best = M, delta, ultimate
         return best
+
+
+def nothing_contracted(rho: float, farthest: float, above: int, rollouts: int) -> str | None:
+    """Why the inequalities say nothing about a team that comes together; None where they do."""
+    if rho == math.inf:
+        return "nothing was contracted: no inequalities with a spectral radius below 1 were found"
+    if 2 * above < rollouts:
+        return (
+            f"nothing was contracted: {above} of {rollouts} rollouts begin above the bound "
+            f"of {farthest:.3g} m that the inequalities give, and at least half have to"
+        )
+    return None
 
 
 class _Windows(eqx.Module):

@@ -1,5 +1,6 @@
 """C3: the paper's decrease condition without any network: does the cost contract over T steps?"""
 
+import dataclasses
 import math
 from typing import ClassVar
 
@@ -11,12 +12,28 @@ from marlyap.certificate import (
     Evidence,
     Found,
     Judgement,
-    Verdict,
     enough,
     judged,
-    share_of,
+    of_share,
+    passing,
+    percent,
+    until_step,
 )
-from marlyap.statistics import lower_bound
+from marlyap.errors import UserError
+
+
+def claim(bound: float, beta: float, T: int, c_min: float, least: float, steps: int, dt: float):
+    """In words, for any beta: one that is not positive is no contraction, but a bound on growth."""
+    of = f"at least {percent(bound)} of the starts whose cost exceeds {c_min:g}"
+    when = f"over every {T} steps that begin above {c_min:g}, {until_step(steps, dt)}"
+    if beta == -math.inf:
+        return f"the cost does not contract: all that is known of {of} is that it stays finite"
+    if beta <= 0:
+        return (
+            f"the cost does not contract: on {of} it grows by up to {percent(-beta, True)} {when}"
+        )
+    little = f", which is less than the {100 * least:g} % asked" if beta < least else ""
+    return f"on {of} the cost falls by at least {percent(beta)}{little} {when}"
 
 
 class Contraction(AbstractCertificate):
@@ -28,7 +45,8 @@ class Contraction(AbstractCertificate):
     decrease of L by beta c that the paper asks for: c is a finite-step Lyapunov function. c_min
     leaves out a ball, for inside it no controller of unicycles can contract at a uniform rate.
 
-    beta is the largest that passes on one set of rollouts, and is then tested on a fresh one. What
+    over the starts that have such a t. beta is the largest that passes on one set of rollouts, and
+    is then tested on a fresh one. A beta that is not positive is no contraction. What
     the cost does after it has fallen below c_min is for C1' to judge.
     """
 
@@ -42,31 +60,43 @@ class Contraction(AbstractCertificate):
     evidence: ClassVar[Evidence] = "statistical"
 
     def check(self, game, controller, V, seed):
+        self.refuse(game, controller, V)
         enough(self.rollouts, self.share, self.confidence)
         H, n = game.horizon, self.rollouts
         first = judged(self.judge, game, controller, V, seed, "calibrate", self.calibration, H + 1)
-        beta = self.largest(rates(first))
+        chosen, beta = rates(first)[first.asked], -math.inf
+        if len(chosen):
+            beta = passing(chosen, self.rollouts, self.share, self.confidence)
         found = judged(self.judge, game, controller, V, seed, "certify", n, H + 1)
-        passed = rates(found) >= beta
-        found = Found(passed, -rates(found), found.figures)
-        bound, shown, fields = share_of(self, game, seed, found, H)
-        asked = int(np.sum(found.figures["windows"] > 0))
-        return Verdict(
+        rate, floor = rates(found), self.floor(game)
+        found = dataclasses.replace(found, holds=found.holds & (rate >= beta), badness=-rate)
+        say = lambda bound: claim(bound, beta, self.T, floor, self.least, H, game.dt)
+        return of_share(
+            self,
+            game,
+            V,
+            seed,
+            found,
+            H,
+            say,
             name="contraction",
-            claim=f"from at least a share {bound:.4f} of the starts the cost contracts by "
-            f"{max(beta, 0.0):.4f} over every {self.T} steps that begin above "
-            f"{self.floor(game):g} m",
-            **fields,
-            holds=shown and beta >= self.least and asked > 0,
+            also=beta >= self.least,
+            to_judge=f"have a cost above {floor:g} with {self.T} steps to go",
             figures={
                 "beta": beta,
                 "T": self.T,
-                "c_min": self.floor(game),
-                "share_asked": self.share,
-                "rollouts_with_a_window": asked,
+                "c_min": floor,
+                "rollouts_with_a_window": int(found.asked.sum()),
                 "calibration": self.calibration,
             },
         )
+
+    def refuse(self, game, controller, V):
+        if self.T > game.horizon:
+            raise UserError(
+                f"contraction: {self.T} steps do not fit into an episode of {game.horizon}; take a "
+                "smaller T."
+            )
 
     def floor(self, game) -> float:
         return game.radius if self.c_min is None else self.c_min
@@ -78,23 +108,10 @@ class Contraction(AbstractCertificate):
         beta = 1.0 - ahead / jnp.where(asked, now, 1.0)
         least = jnp.min(jnp.where(asked, beta, jnp.inf))
         figures = {"beta": jnp.minimum(least, 1.0), "windows": jnp.sum(asked).astype(float)}
-        return Judgement(jnp.asarray(True), -least, figures)
-
-    def largest(self, betas) -> float:
-        """The largest beta that leaves a fresh test of the same size room for bad luck."""
-        allowed = failures_allowed(self.rollouts, self.share, self.confidence)
-        allowed = max(0.0, allowed - 2.5 * math.sqrt(allowed)) / self.rollouts
-        return float(np.sort(betas)[int(allowed * len(betas))])
+        return Judgement(jnp.asarray(True), -least, figures, jnp.any(asked))
 
 
 def rates(found: Found) -> np.ndarray:
     """beta of each rollout; minus infinity where anything was not finite."""
     beta = found.figures["beta"]
     return np.where(found.holds & ~np.isnan(beta), beta, -np.inf)
-
-
-def failures_allowed(trials: int, share: float, confidence: float) -> int:
-    """The most failures in `trials` with which the lower bound still reaches `share`."""
-    failures = np.arange(trials + 1)
-    bounds = np.asarray(lower_bound(trials - failures, trials, confidence))
-    return int(np.sum(bounds >= share)) - 1

@@ -10,11 +10,24 @@ from marlyap.certificate import (
     AbstractCertificate,
     Evidence,
     Judgement,
-    Verdict,
+    arrival,
     enough,
     judged,
-    share_of,
+    of_share,
+    percent,
+    until_step,
 )
+from marlyap.errors import UserError
+
+
+def claim(
+    bound: float, V: str, beta: float, ball: float, arrived: str, steps: int, dt: float
+) -> str:
+    return (
+        f"at least {percent(bound)} of the starts outside the ball come to {arrived} "
+        f"{until_step(steps, dt).replace('until', 'by')}, and in every step before that V, {V}, "
+        f"falls by at least {beta:g} of the mean distance beyond {ball:g} m"
+    )
 
 
 class Decrease(AbstractCertificate):
@@ -22,9 +35,10 @@ class Decrease(AbstractCertificate):
 
         P[ tau <= H, and V(s_{t+1}) - V(s_t) <= -beta c_rho(s_t) for every t < tau ] >= bound,
 
-    with tau the first time at which the game is in its ball of success. A rollout that never gets
-    there has failed, however V behaves. One rollout is one trial: its transitions depend on each
-    other, so the share of transitions that violate is reported without an interval of its own.
+    with tau the first time at which the game is in its ball of success, and over the starts outside
+    it: a start inside leaves nothing to judge. A rollout that never gets there has failed, however
+    V behaves. One rollout is one trial: its transitions depend on each other, so the share of
+    transitions that violate is reported without an interval of its own.
     """
 
     rollouts: int = 10_000
@@ -36,19 +50,23 @@ class Decrease(AbstractCertificate):
 
     def check(self, game, controller, V, seed):
         enough(self.rollouts, self.share, self.confidence)
+        if not self.beta > 0:
+            raise UserError(f"beta: V must fall, so that {self.beta:g} must be more than 0.")
         H, n = game.horizon, self.rollouts
-        found = judged(self.judge, game, controller, V, seed, "certify", n, H + V.beyond)
-        bound, holds, fields = share_of(self, game, seed, found, H)
+        found = judged(self.judge, game, controller, V, seed, "certify", n, H + V.beyond, True)
         steps, bad = (float(np.nansum(found.figures[name])) for name in ("steps", "violations"))
-        return Verdict(
+        say = lambda bound: claim(bound, V.meaning, self.beta, V.ball, arrival(game), H, game.dt)
+        return of_share(
+            self,
+            game,
+            V,
+            seed,
+            found,
+            H,
+            say,
             name="decrease",
-            claim=f"from at least a share {bound:.4f} of the starts V falls by {self.beta:g} of "
-            f"the mean distance beyond {V.ball:g} m in every step until the ball of "
-            f"{game.radius:g} m is entered, which happens within {H * game.dt:g} s",
-            **fields,
-            holds=holds,
+            to_judge="begin outside the ball",
             figures={
-                "share_asked": self.share,
                 "beta": self.beta,
                 "V": type(V).__name__,
                 "transitions_violating": bad / max(steps, 1.0),
@@ -73,4 +91,4 @@ class Decrease(AbstractCertificate):
             "violations": jnp.sum(violated).astype(float),
             "entered": entered.astype(float),
         }
-        return Judgement(entered & ~jnp.any(violated), badness, figures)
+        return Judgement(entered & ~jnp.any(violated), badness, figures, jnp.any(before))

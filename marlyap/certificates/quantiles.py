@@ -1,5 +1,8 @@
 """C5: bounds that hold for all but a few starts, whatever the distribution."""
 
+import decimal
+import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 import jax
@@ -12,7 +15,9 @@ from marlyap.certificate import (
     Judgement,
     Verdict,
     judged,
-    scope,
+    limits,
+    no_lyapunov,
+    until_step,
     worst_of,
 )
 from marlyap.errors import UserError
@@ -20,6 +25,24 @@ from marlyap.statistics import bonferroni, quantile_upper_bound, trials_needed
 
 
 NAMES = ("final_distance", "settling_time", "largest_rise")
+FLOAT32 = 1e-6  # relative: 0.3 seconds may be 0.30000001
+
+
+def claim(q: float, bounds: Mapping[str, float], V: str, steps: int, dt: float) -> str:
+    distance, time, rise = (at_most(bounds[name]) for name in NAMES)
+    m, s = (" m" if distance != "unbounded" else ""), (" s" if time != "unbounded" else "")
+    return (
+        f"each of these is true of at least {100 * q:g} % of starts, {until_step(steps, dt)}: "
+        f"final distance {distance}{m}; settling time {time}{s}; largest rise {rise} of V, {V}"
+    )
+
+
+def at_most(bound: float) -> str:
+    """An upper bound to four digits, rounded up; an infinite one is none."""
+    if not math.isfinite(bound):
+        return "unbounded"
+    upward = decimal.Context(prec=4, rounding=decimal.ROUND_CEILING)
+    return f"at most {float(upward.create_decimal_from_float(bound * (1 - FLOAT32))):.4g}"
 
 
 class Quantiles(AbstractCertificate):
@@ -49,23 +72,21 @@ class Quantiles(AbstractCertificate):
                 f"{each:.6g}; at least {needed} are needed."
             )
         H, n = game.horizon, self.rollouts
-        found = judged(self.judge, game, controller, V, seed, "certify", n, H + V.beyond)
+        found = judged(self.judge, game, controller, V, seed, "certify", n, H + V.beyond, True)
         sample = {
             name: np.where(found.holds & ~np.isnan(v), v, np.inf)
             for name, v in found.figures.items()
         }
         bounds = {name: quantile_upper_bound(sample[name], self.q, each) for name in NAMES}
-        say = lambda name: f"{bounds[name]:.4g}" if np.isfinite(bounds[name]) else "unbounded"
+        void = no_lyapunov(V, found)
         return Verdict(
             name="quantiles",
-            claim=f"from at least a share {self.q:g} of the starts the final distance is at most "
-            f"{say('final_distance')} m; the same share settles within {say('settling_time')} s; "
-            f"and for the same share V never rises by more than {say('largest_rise')}",
+            claim=void or claim(self.q, bounds, V.meaning, H, game.dt),
             evidence=self.evidence,
-            holds=bool(np.all(np.isfinite(list(bounds.values())))),
-            bound=bounds["final_distance"],
+            holds=void is None and bool(np.all(np.isfinite(list(bounds.values())))),
+            bound=None if void else bounds["final_distance"],
             confidence=self.confidence,
-            scope=scope(game, H),
+            scope=limits(game, H),
             trials=n,
             worst=worst_of(game, seed, "certify", found),
             figures={"q": self.q, "bounds": bounds, "V": type(V).__name__},

@@ -9,11 +9,24 @@ from marlyap.certificate import (
     AbstractCertificate,
     Evidence,
     Judgement,
-    Verdict,
+    arrival,
     enough,
     judged,
-    share_of,
+    of_share,
+    percent,
+    until_step,
 )
+
+
+def claim(bound: float, arrived: str, seconds: float) -> str:
+    return f"at least {percent(bound)} of starts end with {arrived} at {seconds:g} s"
+
+
+def claim_stay(bound: float, arrived: str, horizon: int, steps: int, dt: float) -> str:
+    return (
+        f"at least {percent(bound)} of starts have {arrived} at every step from {horizon * dt:g} s "
+        f"{until_step(steps, dt)}"
+    )
 
 
 class Reach(AbstractCertificate):
@@ -33,15 +46,8 @@ class Reach(AbstractCertificate):
         enough(self.rollouts, self.share, self.confidence)
         H = game.horizon
         found = judged(self.judge, game, controller, V, seed, "certify", self.rollouts, H)
-        bound, holds, fields = share_of(self, game, seed, found, H)
-        return Verdict(
-            name="reach",
-            claim=f"from at least a share {bound:.4f} of the starts every agent is within "
-            f"{game.radius:g} m of its goal at {H * game.dt:g} s",
-            **fields,
-            holds=holds,
-            figures={"share_asked": self.share},
-        )
+        say = lambda bound: claim(bound, arrival(game), H * game.dt)
+        return of_share(self, game, V, seed, found, H, say, name="reach")
 
     def judge(self, game, V, trajectory, key):
         last = jax.tree.map(lambda leaf: leaf[-1], trajectory.state)
@@ -67,16 +73,9 @@ class ReachAndStay(AbstractCertificate):
         enough(self.rollouts, self.share, self.confidence)
         steps = game.horizon + self.stay
         found = judged(self.judge, game, controller, V, seed, "certify", self.rollouts, steps)
-        bound, holds, fields = share_of(self, game, seed, found, steps)
-        return Verdict(
-            name="reach-and-stay",
-            claim=f"from at least a share {bound:.4f} of the starts every agent is within "
-            f"{game.radius:g} m of its goal from {game.horizon * game.dt:g} s at the latest "
-            f"until {steps * game.dt:g} s",
-            **fields,
-            holds=holds,
-            figures={"share_asked": self.share, "stay_steps": self.stay},
-        )
+        say = lambda bound: claim_stay(bound, arrival(game), game.horizon, steps, game.dt)
+        name, figures = "reach-and-stay", {"stay_steps": self.stay}
+        return of_share(self, game, V, seed, found, steps, say, name=name, figures=figures)
 
     def judge(self, game, V, trajectory, key):
         late = jax.tree.map(lambda leaf: leaf[game.horizon :], trajectory.state)

@@ -3,23 +3,46 @@
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from marlyap.certificate import (
     AbstractCertificate,
     Evidence,
     Verdict,
+    arrival,
     at_least,
     enough,
     judged,
-    scope,
+    limits,
+    percent,
     worst_of,
 )
 from marlyap.certificates.reach import Reach
+from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.perturb import Perturbed, edge_to_cut, follower_to_lose, traced
 from marlyap.rollout import Controller
 from marlyap.statistics import bonferroni
+from marlyap.types import Key
+
+
+def claim(bound: float, count: int, arrived: str, seconds: float, without: dict[str, str]) -> str:
+    """`without` says for each perturbation that could not be applied why."""
+    left = f" (left out: {listed(without)})" if without else ""
+    return (
+        f"under each of {count} perturbations{left} at least "
+        f"{percent(bound)} of starts end with {arrived} at {seconds:g} s"
+    )
+
+
+def listed(without: dict[str, str]) -> str:
+    """What was left out and why: names with the same reason together."""
+    reasons: dict[str, list[str]] = {}
+    for name, why in without.items():
+        reasons.setdefault(why, []).append(name)
+    return "; ".join(f"{', '.join(names)}, because {why}" for why, names in reasons.items())
 
 
 class Robustness(AbstractCertificate):
@@ -28,7 +51,8 @@ class Robustness(AbstractCertificate):
         P[ distance_i(s_H) <= r for every agent i | w ] >= bound_w,
 
     which is C1 once for every perturbation. It holds if every bound reaches the share asked for;
-    the figures are the curve. A perturbation is one fixed change, not the worst of a set.
+    the figures are the curve. A perturbation is one fixed change, not the worst of a set. One that
+    cannot be applied to this game is left out, and named with the reason.
     """
 
     rollouts: int = 2_000
@@ -43,31 +67,53 @@ class Robustness(AbstractCertificate):
     evidence: ClassVar[Evidence] = "statistical"
 
     def check(self, game, controller, V, seed):
-        curve = self.perturbations(game)
-        each = bonferroni(self.confidence, len(curve))
+        games, without = self.perturbed(game)
+        if not games:
+            raise UserError(f"robustness: no perturbation can be applied ({listed(without)}).")
+        each = bonferroni(self.confidence, len(games))
         enough(self.rollouts, self.share, each)
         points, weakest = [], None
-        for name, change in curve.items():
-            point = self.point(traced(Perturbed(inner=game, **change)), controller, V, seed, each)
+        for name, (change, other) in games.items():
+            point = self.point(other, controller, V, seed, each)
             points.append({"perturbation": name, "change": change} | point)
             if weakest is None or point["successes"] < weakest["successes"]:
                 weakest = points[-1]
         least = min(p["bound"] for p in points)
+        disturbance = f"each in turn: {', '.join(games)}"
         return Verdict(
             name="robustness",
-            claim=f"under each of {len(points)} perturbations, from at least a share {least:.4f} "
-            f"of the starts every agent is within {game.radius:g} m of its goal at "
-            f"{game.horizon * game.dt:g} s",
+            claim=claim(least, len(points), arrival(game), game.horizon * game.dt, without),
             evidence=self.evidence,
             holds=all(p["holds"] for p in points),
             bound=least,
             confidence=self.confidence,
-            scope=scope(game, game.horizon, "each of the perturbations in turn"),
+            scope=limits(game, game.horizon, disturbance),
             trials=self.rollouts * len(points),
             successes=sum(p["successes"] for p in points),
             worst=None if weakest is None else weakest["worst"] | {"change": weakest["change"]},
-            figures={"share_asked": self.share, "confidence_each": each, "curve": points},
+            figures={
+                "share_asked": self.share,
+                "confidence_each": each,
+                "curve": points,
+                "without": without,
+            },
         )
+
+    def perturbed(
+        self, game: AbstractGame
+    ) -> tuple[dict[str, tuple[dict[str, Any], Perturbed]], dict[str, str]]:
+        """The points of the curve that can be tested, and why the others cannot."""
+        games, without = {}, {}
+        idle = self.gains and gain_is_idle(game)
+        for name, change in self.perturbations(game).items():
+            if idle and "gain" in change:
+                without[name] = "the inputs of this game do not get stronger by `strengthened`"
+                continue
+            try:
+                games[name] = change, traced(Perturbed(inner=game, **change))
+            except UserError as error:
+                without[name] = str(error).removeprefix("perturbation: ").rstrip(".")
+        return games, without
 
     def point(
         self, game: Perturbed, controller: Controller, V: Any, seed: int, each: float
@@ -103,3 +149,18 @@ def moved(controller: Controller, game: Perturbed) -> Controller:
         return controller
     eyes = eqx.tree_at(lambda g: g.gain, game, jnp.asarray(1.0))
     return eqx.tree_at(lambda c: c.game, controller, eyes)  # pyright: ignore
+
+
+def gain_is_idle(game: AbstractGame) -> bool:
+    """Whether twice the gain changes nothing in how driven agents move."""
+    stronger = game.strengthened(jnp.asarray(2.0))
+
+    def same(key: Key) -> Bool[Array, ""]:
+        k_start, k_act = jax.random.split(key)
+        state, shape = game.reset(k_start), (game.agents, game.dynamics.du)
+        action = jax.random.uniform(k_act, shape, minval=0.1, maxval=0.4)
+        for _ in range(2):  # inputs may act late
+            state = game.step(state, action)
+        return jnp.all(game.step(state, action).x == stronger.step(state, action).x)
+
+    return bool(jnp.all(jax.vmap(same)(jax.random.split(jax.random.key(0), 8))))

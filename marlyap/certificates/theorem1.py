@@ -1,5 +1,6 @@
 """Theorem 1 (section 3.2), repaired, on fresh tuples."""
 
+import dataclasses
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
@@ -11,18 +12,25 @@ from marlyap.certificate import (
     AbstractCertificate,
     Evidence,
     Judgement,
-    Verdict,
-    at_least,
     enough,
     judged,
-    scope,
-    worst_of,
+    no_lyapunov,
+    of_share,
+    percent,
 )
+from marlyap.certificates.jacobian import jacobian
 from marlyap.dynamics import AbstractDynamics, Unicycle
 from marlyap.game import AbstractGame
 from marlyap.layout import grad
 from marlyap.lyapunov_function import Norm
 from marlyap.rollout import Controller
+
+
+def claim(bound: float, V: str) -> str:
+    return (
+        f"at least {percent(bound)} of the states met outside the ball, one of each rollout, "
+        f"satisfy condition (13) for V, {V}; the theorem asks for all of them"
+    )
 
 
 class Theorem1(AbstractCertificate):
@@ -40,7 +48,8 @@ class Theorem1(AbstractCertificate):
     state, so that the conclusion of the theorem does not follow from it. The new policy is the
     controller. The old one is `old`, or else its action plus noise. Actions are in physical units,
     distances those of the physical state. l_L is the largest gradient of V that was seen, an
-    estimate from below (the evidence is then no more than observed), or V's spectral bound.
+    estimate from below (the evidence is then no more than observed), or V's spectral bound. For a
+    game with a step of its own l_f is such an estimate too.
     """
 
     old: Controller | None = None
@@ -57,39 +66,50 @@ class Theorem1(AbstractCertificate):
         enough(self.rollouts, self.share, self.confidence)
         n, H = self.rollouts, game.horizon
         judge = _Tuple(controller, self.old, self.noise)
-        before = judged(judge, game, controller, V, seed, "calibrate", n, H + V.beyond)
-        found = judged(judge, game, controller, V, seed, "certify", n, H + V.beyond)
+        draw = lambda purpose: judged(
+            judge, game, controller, V, seed, purpose, n, H + V.beyond, True
+        )
+        before, found = draw("calibrate"), draw("certify")
         fig = found.figures
         constants = self.constants(game, V, before.figures)
         l = constants[self.lipschitz] if self.lipschitz in constants else constants["empirical"]
-        asked = fig["outside"] > 0
+        asked, sound = fig["outside"] > 0, found.holds
         excess = fig["next_V"] + l * constants["l_f"] * fig["moved"] - (1 - self.rate) * fig["V"]
-        fine = found.holds & (excess <= 0)
-        m, k = int(asked.sum()), int((fine & asked).sum())
-        bound, shown = at_least(k, m, self.share, self.confidence)
-        found = type(found)(fine, np.where(np.isnan(excess), np.inf, excess), fig)
-        return Verdict(
+        found = dataclasses.replace(
+            found,
+            holds=sound & (excess <= 0),
+            badness=np.where(np.isnan(excess), np.inf, excess),
+            asked=asked | ~sound,
+        )
+        exact = l == constants.get("spectral") and not own_step(game)
+        say = lambda bound: claim(bound, V.meaning)
+        return of_share(
+            self,
+            game,
+            V,
+            seed,
+            found,
+            H,
+            say,
             name="theorem1",
-            claim=f"at least a share {bound:.4f} of the tuples met outside the ball satisfies "
-            "condition (13); the theorem asks for all of them",
-            evidence=self.evidence if l == constants.get("spectral") else "observed",
-            holds=shown,
-            bound=bound,
-            confidence=self.confidence,
-            scope=scope(game, H) | {"tuples": "one per rollout, at a random time"},
-            trials=m,
-            successes=k,
-            worst=worst_of(game, seed, "certify", found, asked) if m else None,
+            void=no_lyapunov(V, before, found),
+            to_judge="gave a state outside the ball",
+            evidence=self.evidence if exact else "observed",
+            scope={"tuples": "one per rollout, at a random time"},
             figures=constants
-            | {"share_asked": self.share, "l_L": l, "V": type(V).__name__}
-            | {"margin_median": float(np.median(-excess[asked])) if m else None}
-            | {"margin_worst": float(np.min(-excess[asked])) if m else None},
+            | {"l_L": l, "V": type(V).__name__}
+            | {"margin_median": float(np.median(-excess[asked])) if asked.any() else None}
+            | {"margin_worst": float(np.min(-excess[asked])) if asked.any() else None},
         )
 
     def constants(self, game: AbstractGame, V: Any, seen: dict[str, np.ndarray]) -> dict[str, Any]:
         """l_f, and l_L by each means there is, over the calibration's region."""
         speed, reach = float(np.nanmax(seen["speed"])), float(np.nanmax(seen["reach"]))
-        out = {"l_f": l_f(game.dynamics, game.dt, speed), "speed": speed, "reach": reach}
+        out = {"speed": speed, "reach": reach}
+        if own_step(game):  # the dynamics are not what moves the agents
+            out["l_f"] = float(np.nanmax(seen["input_gain"]))
+        else:
+            out["l_f"] = l_f(game.dynamics, game.dt, speed)
         out["empirical"] = float(np.nanmax(seen["gradient"]))
         if isinstance(V, Norm):
             out["spectral"] = float(V.net.lipschitz()) * float(np.sqrt(1 + reach**2))
@@ -123,6 +143,10 @@ class _Tuple(eqx.Module):
             "reach": jnp.max(game.distance(state)),
             "outside": (~game.success(state)).astype(float),
         }
+        if own_step(game):
+            after = lambda u: game.step(state, u.reshape(new.shape) / scale).x.ravel()
+            gain = jacobian(after, (jnp.clip(new, -1.0, 1.0) * scale).ravel())
+            figures["input_gain"] = jnp.linalg.norm(gain, ord=2)
         return Judgement(jnp.asarray(True), jnp.zeros(()), figures)
 
 
@@ -142,7 +166,12 @@ def l_f(dynamics: AbstractDynamics, dt: float, speed: float) -> float:
     return float(np.linalg.norm(input_jacobian(dynamics, x, dt), 2))
 
 
+def own_step(game: AbstractGame) -> bool:
+    """Whether the game moves its agents otherwise than by its dynamics."""
+    return type(game).step is not AbstractGame.step
+
+
 def input_jacobian(dynamics: AbstractDynamics, x: Any, dt: float) -> np.ndarray:
     """ds'/du in physical units, by automatic differentiation."""
     step = lambda u: dynamics.step(x, u / jnp.asarray(dynamics.limits), dt)
-    return np.asarray(jax.jacfwd(step)(jnp.zeros(dynamics.du)), float)
+    return np.asarray(jacobian(step, jnp.zeros(dynamics.du)), float)

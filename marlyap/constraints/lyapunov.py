@@ -10,17 +10,31 @@
 
 The paper prints one beta for the weight and for the share of the cost by which L must fall; here
 they are two. As printed, Delta L has a gradient through ||a_phi - a|| alone, which clones the
-actions in the memory, so what is meant has to be read into it:
+actions in the memory, so it needs an interpretation. There are five, called readings; in all of
+them a is from the memory unless said otherwise:
 
-    han      L(s', a') - L(s, a) + decrease c,  a' from the current policy and a from the memory
-             (Han et al. 2020); the default
-    literal  the same with a' from the memory, plus slope ||a_phi - a||
-    hinge    max(0, L(s') - L(s) + decrease c + slope ||a_phi - a||), only where the action in the
-             memory did make L fall: imitate what worked (Theorem 1 holds for any tuple)
+    han      L(s', a') - L(s, a) + decrease c, with a' drawn from the current policy (Han et al.
+             2020); the default
+    literal  the same without gradient, plus slope ||a_phi - a||. The paper has a' from the memory;
+             transitions hold no next action, so here too it is drawn from the current policy
+    hinge    max(0, L(s', a') - L(s, a) + decrease c + slope ||a_phi - a||), only where
+             L(s', a') - L(s, a) + decrease c <= 0: imitate what worked (Theorem 1 holds for any
+             tuple)
     score    raise the likelihood of actions after which the state function L fell, and lower it of
              those after which it rose, with a clipped ratio (as in proximal policy optimisation)
     critic   L(s, a) itself, with a from the current policy: no Lyapunov condition at all, but the
-             same sum of the next T costs; the control that tells what the condition adds to it
+             same sum of the next T costs; the control that shows what the condition adds
+
+What the condition does not say:
+
+* It is asked of the mean of a batch: one weight, raised while that mean is positive, penalises all
+  states alike. At single states it holds only as far as it is measured (certificate `decrease`).
+* The weight follows L(s', a') - L(s, a) + decrease c. For `literal` and `hinge` the margin
+  slope ||a_phi - a|| is part of the penalty and not of what the weight follows.
+* J_L is fitted to the whole replay memory, random warm-up included: L is the T-step cost sum of
+  a mixture of old policies, not of the current one.
+* L is a sum of squares of features and not zero on the target set by construction; with function
+  `norm` it is.
 """
 
 from typing import Literal
@@ -43,12 +57,15 @@ class Certificate(eqx.Module):
     net: Learnt[LyapunovNet | NormNet]
     net_bar: LyapunovNet | NormNet  # slow copy, for targets that bootstrap
     log_weight: Learnt[Scalar]
-    gradient: Scalar  # l_L: the 95 % quantile of |grad L| over batches, a running mean
+    gradient: Scalar  # the 95 % quantile over a batch of |grad L| by features, a running mean
     scale: Scalar  # running mean square of the fall of L, for `score`
 
 
 class Lyapunov(AbstractConstraint):
-    """Algorithm 2's term `weight * Delta L` in J_pi, with L learnt beside it."""
+    """Algorithm 2's term `weight * Delta L` in J_pi, with L learnt beside it.
+
+    Raises UserError for values out of range and for readings and functions that do not fit.
+    """
 
     reading: Literal["han", "literal", "hinge", "score", "critic"] = (
         "han"  # how Delta L is read (see above)
@@ -63,7 +80,7 @@ class Lyapunov(AbstractConstraint):
     floor: float = 1e-3  # smallest learnt weight
     ball: float = 0.0  # the constraint holds only where the team's cost exceeds this (m)
     agents: tuple[int, ...] = ()  # whose costs and actions it is about; empty: everybody's
-    slope: float | Literal["empirical", "spectral"] = 0.0  # l_L l_f, or how to estimate l_L
+    slope: float | Literal["empirical", "spectral"] = 0.0  # l_L l_f, or how l_L is estimated
     input_gain: float = 0.505  # l_f per unit of action: 0.101 for the unicycle at 0.1 s, times 5
     clip: float = 0.2  # the ratio of `score` stays within 1 -+ this
     normalise: bool = False  # LayerNorm in L
@@ -111,7 +128,11 @@ class Lyapunov(AbstractConstraint):
         return L.net.value
 
     def penalty(self, L, b, now, nxt):
-        """weight * Delta L of one transition, eq. (14), in the chosen reading."""
+        """weight * Delta L of one transition, eq. (14), in the chosen reading.
+
+        The action in the memory is b.action; `now` and `nxt` are drawn from the current policy at s
+        and s'.
+        """
         now, nxt = self.held(now), self.held(nxt)
         net, moved = L.net.value, distance(now.action, b.action)
         if self.reading == "han":
@@ -131,7 +152,7 @@ class Lyapunov(AbstractConstraint):
         return self.multiplier(L) * jnp.where(self.applies(b), term, 0.0)
 
     def rise(self, L: Certificate, b: Transition, next_action: Action) -> Scalar:
-        """L(s', a') - L(s, a) + decrease c, without Theorem 1's margin."""
+        """L(s', a') - L(s, a) + decrease c, without the margin slope ||a_phi - a|| of Theorem 1."""
         net = L.net.value
         fall = net(b.features, b.action) - net(b.next_features, next_action)
         return self.decrease * self.team(b.cost) - fall
@@ -141,7 +162,7 @@ class Lyapunov(AbstractConstraint):
         return 0.5 * (net(b.features, b.action) - self.L_target(L, b, nxt)) ** 2
 
     def L_target(self, L: Certificate, b: Transition, nxt: Sample) -> Scalar:
-        """The sum of the next T costs: as rolled out, or put together from c and the slow L."""
+        """The sum of the next T costs: as rolled out, or bootstrapped from c and the slow L."""
         now, ahead = self.team(b.cost), self.team(b.cost_ahead)
         if self.target == "bootstrap":
             return now - ahead + L.net_bar(b.next_features, nxt.action)
@@ -150,7 +171,7 @@ class Lyapunov(AbstractConstraint):
         return self.team(b.cost_to_go)
 
     def update(self, L, b, now, nxt, decay):
-        """psi <- psi - iota_L grad J_L, and the dual step on the weight."""
+        """psi <- psi - iota_L grad J_L, and the dual step: the weight follows the mean rise."""
         J_L = lambda net, b, nxt: self.J_L(net, b, nxt, L)
         net, loss = L.net.descend(J_L, b, nxt, rate=decay * self.rate_L)
 
@@ -178,7 +199,7 @@ class Lyapunov(AbstractConstraint):
         return jax.lax.stop_gradient(jnp.exp(L.log_weight.value))
 
     def applies(self, b: Transition) -> Array:
-        """Whether the constraint is asked for here: outside the ball."""
+        """Whether the constraint applies here: outside the ball."""
         return self.team(b.cost) > self.ball if self.ball > 0 else jnp.asarray(True)
 
     def team(self, per_agent: Float[Array, "agent"]) -> Scalar:
@@ -186,7 +207,7 @@ class Lyapunov(AbstractConstraint):
         return jnp.mean(per_agent[jnp.array(self.agents)] if self.agents else per_agent)
 
     def held(self, drawn: Sample) -> Sample:
-        """Drawn actions of which only those of the agents the constraint is about can yield."""
+        """The drawn actions, with a gradient only for the agents that the constraint is about."""
         if not self.agents:
             return drawn
         everyone = jnp.arange(drawn.action.shape[0])
@@ -203,7 +224,10 @@ class Lyapunov(AbstractConstraint):
         return jnp.asarray(self.slope)
 
     def steepness(self, L: Certificate, b: Transition) -> Scalar:
-        """The running 95 % quantile of |grad_s L|: an estimate from below of l_L."""
+        """The running 95 % quantile of |grad L| by the critic's features.
+
+        Not l_L of Theorem 1, which is a bound (not a quantile) by the state s (not its features).
+        """
         total = lambda features: jnp.sum(jax.vmap(L.net.value)(features, b.action))
         size = jnp.sqrt(jnp.sum(jax.grad(total)(b.features) ** 2, axis=(1, 2)))
         return 0.99 * L.gradient + 0.01 * jnp.quantile(size, 0.95)

@@ -8,32 +8,39 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from marlyap.dynamics import AbstractDynamics, Unicycle
+from marlyap.dynamics import AbstractDynamics
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.types import Action, Key, State
 
 
 class AbstractController(eqx.Module):
-    """A control law for a team of unicycles; its fields are its gains.
+    """A control law for a team; its fields are the game and the gains.
 
-    Row i of the action depends on agent i, on its neighbours in this state and, for a leader, on
-    its goal. A controller keeps no memory, and is a pytree, so that jit compiles it once.
+    Row i of the action may depend on agent i, on its neighbours in this state and, for a leader,
+    on its goal. Nothing enforces this: a law that reads more is centralised. A controller keeps no
+    memory, and is a pytree, so that jit compiles it once.
+
+    Raises UserError for a game whose dynamics are none of `drives`.
     """
 
     game: eqx.AbstractVar[AbstractGame]
-    drives: ClassVar[tuple[type[AbstractDynamics], ...]] = (Unicycle,)
+    drives: ClassVar[tuple[type[AbstractDynamics], ...]] = ()  # exactly these; empty: any
 
     def __check_init__(self):
-        if type(self.game.dynamics) not in self.drives:
+        if self.drives and type(self.game.dynamics) not in self.drives:
+            known = " or ".join(cls.__name__ for cls in self.drives)
             raise UserError(
-                f"controller: {type(self).__name__} drives unicycles only, not "
-                f"{type(self.game.dynamics).__name__}; choose the dynamics unicycle."
+                f"controller: {type(self).__name__} drives {known} only, not "
+                f"{type(self.game.dynamics).__name__}; choose other dynamics for the task."
             )
 
     @abc.abstractmethod
     def __call__(self, state: State, key: Key) -> Action:
-        """The inputs of all agents, each divided by its limit, in [-1, 1]."""
+        """The inputs of all agents, each divided by its limit, in [-1, 1].
+
+        `key` is for laws that act at random.
+        """
 
 
 def headings(game: AbstractGame, state: State) -> Float[Array, "agent 2"]:

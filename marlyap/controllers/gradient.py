@@ -4,6 +4,7 @@ import jax
 
 from marlyap.controllers.cascade import Cascade
 from marlyap.controllers.controller import AbstractController, as_action, mean_pull
+from marlyap.dynamics import Unicycle
 from marlyap.game import AbstractGame
 
 
@@ -12,6 +13,8 @@ class GradientConsensus(AbstractController):
 
     The leader gain decides: with b = 1, plain averaging, a leader waits for its followers.
     """
+
+    drives = (Unicycle,)
 
     game: AbstractGame
     leader_gain: float = 20.0  # b, weight of the goal against one neighbour

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 
 from marlyap.controllers.controller import AbstractController, as_action, headings, mean_pull
+from marlyap.dynamics import Unicycle
 from marlyap.game import AbstractGame
 
 
@@ -14,6 +15,8 @@ class LinFrancisMaggiore(AbstractController):
     Here the sum is a mean, a leader counts its goal as a neighbour of weight b, and the speeds are
     tracked by a = k_a (v_d - v), r = k_r (w_d - w). Slow, and shipped for completeness.
     """
+
+    drives = (Unicycle,)
 
     game: AbstractGame
     gain: float = 1.0  # k (1/s)

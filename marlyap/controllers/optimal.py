@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from marlyap.controllers.controller import AbstractController
+from marlyap.dynamics import Unicycle
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.rollout import AbstractPlanner
@@ -37,6 +38,8 @@ class OptimalControl(AbstractPlanner, AbstractController):
     problem is solved in multiple shooting from two guesses, forwards and in reverse, by ipopt
     (Waechter and Biegler, Math. Programming 106, 2006) through casadi.
     """
+
+    drives = (Unicycle,)
 
     game: AbstractGame
     miss: float = 1e2  # weight of the final distance (1/m^2)

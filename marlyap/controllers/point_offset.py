@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 
 from marlyap.controllers.controller import AbstractController, as_action, headings, left, mean_pull
+from marlyap.dynamics import Unicycle
 from marlyap.game import AbstractGame
 
 
@@ -14,6 +15,8 @@ class PointOffset(AbstractController):
     an undirected connected graph for any positive gains. The agent itself rests d metres from the
     goal, which a unicycle, unlike z_i, cannot approach exponentially (Brockett).
     """
+
+    drives = (Unicycle,)
 
     game: AbstractGame
     offset: float = 0.015  # d (m), smaller than the radius of success
