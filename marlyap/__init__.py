@@ -3,14 +3,22 @@
 The names below are imported on first use, so that `import marlyap` costs nothing.
 """
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 
 if TYPE_CHECKING:
+    from marlyap.algorithm import AbstractOffPolicy as AbstractOffPolicy
     from marlyap.algorithms import APG as APG, MASAC as MASAC
+    from marlyap.certificate import AbstractCertificate as AbstractCertificate
+    from marlyap.certify import certify as certify
+    from marlyap.constraint import AbstractConstraint as AbstractConstraint
     from marlyap.constraints import Lyapunov as Lyapunov, Unconstrained as Unconstrained
+    from marlyap.controllers import AbstractController as AbstractController
     from marlyap.dynamics import (
+        AbstractDynamics as AbstractDynamics,
         DoubleIntegrator as DoubleIntegrator,
         LateUnicycle as LateUnicycle,
         SingleIntegrator as SingleIntegrator,
@@ -20,21 +28,34 @@ if TYPE_CHECKING:
     from marlyap.evaluation import compare as compare, evaluate as evaluate
     from marlyap.fit import train as train
     from marlyap.game import AbstractGame as AbstractGame
-    from marlyap.rollout import Decentralised as Decentralised
+    from marlyap.lyapunov_function import AbstractLyapunov as AbstractLyapunov
+    from marlyap.rollout import Decentralised as Decentralised, rollout as rollout
     from marlyap.run import Run as Run
     from marlyap.tasks import Formation as Formation, Rendezvous as Rendezvous
     from marlyap.trainer import Schedule as Schedule, Trainer as Trainer
     from marlyap.types import State as State
 
 PUBLIC = {
+    "algorithm": ("AbstractOffPolicy",),
     "algorithms": ("APG", "MASAC"),
+    "certificate": ("AbstractCertificate",),
+    "certify": ("certify",),
+    "constraint": ("AbstractConstraint",),
     "constraints": ("Lyapunov", "Unconstrained"),
-    "dynamics": ("DoubleIntegrator", "LateUnicycle", "SingleIntegrator", "Unicycle"),
+    "controllers": ("AbstractController",),
+    "dynamics": (
+        "AbstractDynamics",
+        "DoubleIntegrator",
+        "LateUnicycle",
+        "SingleIntegrator",
+        "Unicycle",
+    ),
     "errors": ("UserError",),
     "evaluation": ("compare", "evaluate"),
     "fit": ("train",),
     "game": ("AbstractGame",),
-    "rollout": ("Decentralised",),
+    "lyapunov_function": ("AbstractLyapunov",),
+    "rollout": ("Decentralised", "rollout"),
     "run": ("Run",),
     "tasks": ("Formation", "Rendezvous"),
     "trainer": ("Schedule", "Trainer"),
@@ -45,8 +66,26 @@ __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("marlyap")
     if name not in _HOME:
         raise AttributeError(f"module 'marlyap' has no attribute '{name}'")
     value = getattr(import_module(f"marlyap.{_HOME[name]}"), name)
     globals()[name] = value
     return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])
+
+
+class _Package(ModuleType):
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Leave `marlyap.certify` the function when Python has imported the module of that name."""
+        if not (name in _HOME and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -1,5 +1,6 @@
 """What the user can correct, said in one sentence."""
 
+import dataclasses
 import inspect
 import re
 import sysconfig
@@ -31,6 +32,26 @@ def within(
     if not (low < value if open else low <= value) or not value <= high:
         least = f"more than {low:g}" if open else f"{low:g}"
         raise UserError(f"{name}: {value} is out of range; take {least} to {high:g}.")
+
+
+def whole_fields(obj: Any) -> None:
+    """Raise UserError for a field of a dataclass that has to hold whole numbers and does not.
+
+    Python would take 1e5 for it, and JAX would fail much later.
+    """
+    is_whole = lambda value: isinstance(value, int) and not isinstance(value, bool)
+    for field in dataclasses.fields(obj):
+        value = getattr(obj, field.name)
+        if field.type in (int, "int") and not is_whole(value):
+            remedy = (
+                f"write {int(value)}" if isinstance(value, float) and value % 1 == 0 else "use one"
+            )
+            raise UserError(f"{field.name}: {value!r} is not a whole number (int); {remedy}.")
+        if field.type in (tuple[int, ...], "tuple[int, ...]") and not (
+            isinstance(value, tuple) and all(map(is_whole, value))
+        ):
+            remedy = f"write ({value!r},)" if is_whole(value) else "write one such as (0, 1)"
+            raise UserError(f"{field.name}: {value!r} is not a tuple of whole numbers; {remedy}.")
 
 
 def whole(text: str) -> int:

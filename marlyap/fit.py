@@ -1,10 +1,11 @@
 """The host loop over compiled iterations: progress, log, checkpoints, stopping."""
 
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import chain, groupby
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,14 +13,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from marlyap import devices, programs, store
+from marlyap import config, devices, programs, store
 from marlyap.algorithm import AbstractAlgorithm
+from marlyap.algorithms import ALGORITHMS
+from marlyap.cache import enable_cache
 from marlyap.diagnose import diagnose
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.nets import LyapunovNet, NormNet
+from marlyap.progress import show
 from marlyap.rollout import Decentralised, Policy
-from marlyap.run import FROM_TASK, Run, begin
+from marlyap.run import FROM_TASK, Run, begin, sound
+from marlyap.tasks import TASKS
 from marlyap.trainer import Carry, Schedule, Trainer, schedule_for
 
 
@@ -163,39 +168,85 @@ class Trained:
     lyapunov: LyapunovNet | NormNet | None
     game: AbstractGame
     history: list[dict[str, Any]]
+    trainer: Trainer
+    seed: int
+    carry: Carry  # all of it, so that it can be saved and resumed
 
     @property
     def controller(self) -> Decentralised:
         """The policy as a controller of its game, to be evaluated or certified."""
         return Decentralised(self.policy, self.game)
 
+    def save(self, directory: Path | str) -> Run:
+        """Write a run directory, as `marlyap train` does: to be evaluated, reported and certified.
+
+        Raises UserError where there is something already.
+        """
+        parts = {"task": (self.game, TASKS), "algorithm": (self.trainer.algorithm, ALGORITHMS)}
+        names = {part: _called(*found) for part, found in parts.items()} | {"preset": "tuned"}
+        run = Run.create(directory, self.trainer, self.seed, names)
+        with store.lock(run.directory):
+            for line in self.history:
+                run.log(line)
+            run.save(self.carry, self.history[-1]["seconds"])
+        return run
+
+
+def _called(thing: Any, table: Mapping[str, Any]) -> str:
+    """The name of a task or algorithm in its table, else that of its class."""
+    same = lambda o: type(o) is type(thing) and config.record(o) == config.record(thing)
+    return next((name for name, o in table.items() if same(o)), type(thing).__name__)
+
 
 def train(
-    game: AbstractGame,
-    algorithm: AbstractAlgorithm,
+    game: AbstractGame | str,
+    algorithm: AbstractAlgorithm | str,
     schedule: Schedule | None = None,
     seed: int = 0,
     on_iteration: Callable[[dict[str, Any]], None] | None = None,
+    progress: bool = True,
 ) -> Trained:
-    """Train one team in memory; nothing is written. For long trainings use `Run` and `fit`.
+    """Train one team in memory; nothing is written until `Trained.save`.
 
-    Without a schedule, the tuned one for this algorithm.
+    Game and algorithm may be names of `marlyap list`, or path/to/file.py:Name. Without a schedule,
+    the tuned one for this algorithm. `on_iteration` is given one dict an iteration. With
+    `progress`, a terminal or notebook shows a bar. Compiled programs are kept for the next start
+    (`cache.enable_cache`).
 
-    `on_iteration` is given one dict an iteration. Raises Diverged (a UserError) when a number
-    stops being finite.
+    Raises UserError for what cannot be trained, and Diverged (a UserError) when a number stops
+    being finite.
     """
+    enable_cache(programs=True)
+    game = config.load(game, AbstractGame) if isinstance(game, str) else game
+    if isinstance(algorithm, str):
+        algorithm = config.load(algorithm, AbstractAlgorithm)
+    sound(game)
     trainer = Trainer(game, algorithm, schedule or schedule_for(algorithm))
-    history, clock = [], time.monotonic()
-    first = carry = _stack([begin(trainer, seed)])
-    for done, carry, rows in advance(trainer, first):  # noqa: B007
-        line = _line(trainer, seed, done, time.monotonic() - clock, rows, 0)
-        if fault := _fault(line):
-            raise Diverged(_advice(fault, line, game.agents) + ".")
-        history.append(_told(line))
-        if on_iteration:
-            on_iteration(history[-1])
-    last = _row(carry, 0)
-    return Trained(last.best, algorithm.lyapunov(last.learner), game, history)
+    last: list[Carry] = []
+    history = []
+
+    def events() -> Iterator[dict[str, Any]]:
+        clock = time.monotonic()
+        first = _stack([begin(trainer, seed)])
+        for done, carry, rows in advance(trainer, first):
+            last[:] = [carry]
+            line = _line(trainer, seed, done, time.monotonic() - clock, rows, 0)
+            if fault := _fault(line):
+                raise Diverged(_advice(fault, line, game.agents) + ".")
+            history.append(_told(line))
+            if on_iteration:
+                on_iteration(history[-1])
+            yield history[-1] | {"iterations": trainer.iterations}
+
+    if progress:
+        show(events(), [seed], plain=False)
+    else:
+        for _ in events():
+            pass
+    carry = _row(last[0], 0)
+    return Trained(
+        carry.best, algorithm.lyapunov(carry.learner), game, history, trainer, seed, carry
+    )
 
 
 class _Saved:

@@ -5,6 +5,7 @@ learning rule.
 """
 
 import abc
+import dataclasses
 from functools import lru_cache
 
 import equinox as eqx
@@ -15,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from marlyap import graph as graphs
 from marlyap.dynamics import AbstractDynamics
-from marlyap.errors import UserError
+from marlyap.errors import UserError, whole_fields
 from marlyap.sensing import Entry, body_frame, body_frame_entries, goal_errors, near
 from marlyap.types import Action, Features, Key, Links, Obs, Scalar, State
 
@@ -37,6 +38,7 @@ class AbstractGame(eqx.Module):
     dynamics: eqx.AbstractVar[AbstractDynamics]
 
     def __check_init__(self):
+        whole_fields(self)
         n = self.agents
         if not 1 <= n <= 4096:
             raise UserError(f"agents: {n} is out of range; a team has 1 to 4096 agents.")
@@ -53,6 +55,10 @@ class AbstractGame(eqx.Module):
                 f"leaders: {self.leaders} must name at least one agent, each from 0 to {n - 1}."
             )
         graphs.adjacency(self.graph, n)
+
+    def __repr__(self) -> str:
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.init}
+        return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in values.items())})"
 
     @abc.abstractmethod
     def reset(self, key: Key) -> State:

@@ -9,9 +9,9 @@ policy/         the best policy so far, and the Lyapunov function: what is evalu
 import json
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,7 @@ class Run:
     @classmethod
     def create(
         cls,
-        directory: Path,
+        directory: Path | str,
         trainer: Trainer,
         seed: int,
         names: dict[str, str],
@@ -60,6 +60,7 @@ class Run:
         Raises UserError if it exists, unless `force` empties it, or if the task returns a wrong
         shape.
         """
+        directory = Path(directory)
         sound(trainer.game)
         cls.vacant(directory, force)
         if directory.exists():
@@ -121,7 +122,7 @@ class Run:
     @classmethod
     def open(
         cls,
-        directory: Path,
+        directory: Path | str,
         game: AbstractGame | None = None,
         algorithm: AbstractAlgorithm | None = None,
     ) -> "Run":
@@ -129,6 +130,7 @@ class Run:
 
         Raises UserError if the directory is not a run, or was changed, or is from a newer version.
         """
+        directory = Path(directory)
         if not (directory / "run.json").is_file():
             raise UserError(f"run: {directory} is not a run (it has no run.json).")
         about = store.read_json(directory / "run.json")
@@ -168,7 +170,8 @@ class Run:
         for part, family in zip(parts, (AbstractGame, AbstractAlgorithm, Schedule), strict=True):
             if not isinstance(part, family):
                 raise UserError(f"run: {where} has a {type(part).__name__} in the wrong place.")
-        return cls(directory, Trainer(*parts), about["seed"], names, tuple(warnings))
+        run = cls(directory, Trainer(*parts), about["seed"], names, tuple(warnings))
+        return replace(run, warnings=(*warnings, *run._log_faults()))
 
     @property
     def untouched(self) -> bool:
@@ -262,6 +265,20 @@ class Run:
         lines = store.read_jsonl(path) if path.is_file() else []
         return [line for line in lines if isinstance(line, dict)]
 
+    def _log_faults(self) -> Iterator[str]:
+        """What is missing from the log of the iterations that the newest checkpoint has done."""
+        done = max(self.checkpoints.steps(), default=0)
+        try:
+            last = max((line.get("iteration", 0) for line in self.history()), default=0)
+        except (UserError, TypeError) as error:
+            yield f"log: {error} The learning curves will be missing."
+            return
+        if last < done:
+            yield (
+                f"log: {self.directory / 'log.jsonl'} ends at iteration {last} of {done}; the "
+                "learning curves will be cut short."
+            )
+
     def rewind(self, iteration: int) -> None:
         """Forget what the log says of iterations that will be done again."""
         kept = [line for line in self.history() if line.get("iteration", 0) <= iteration]
@@ -323,13 +340,13 @@ def sound(game: AbstractGame) -> None:
         raise UserError(f"task: {f'{place}: ' if place else ''}{fault}")
 
 
-def expand(paths: Iterable[Path]) -> list[Path]:
+def expand(paths: Iterable[Path | str]) -> list[Path]:
     """Run directories: those given, and those one level below the others.
 
     Raises UserError where there is none, or one is given twice.
     """
     found: list[Path] = []
-    for path in paths:
+    for path in map(Path, paths):
         here = [path] if (path / "run.json").exists() else sorted(path.glob("*/run.json"))
         if not here:
             raise UserError(f"run: {path} is not a run and holds none.")

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from marlyap.algorithm import AbstractAlgorithm, AbstractModelBased, AbstractOffPolicy
 from marlyap.devices import gathered, spread
-from marlyap.errors import within
+from marlyap.errors import whole_fields, within
 from marlyap.evaluation import outcomes
 from marlyap.game import AbstractGame
 from marlyap.nets import Shape
@@ -45,6 +45,7 @@ class Schedule(eqx.Module):
     judge_episodes: int = 500  # starts on which the best policy so far is chosen
 
     def __check_init__(self):
+        whole_fields(self)
         for name, low, high in (
             ("steps", 1, 10**12),
             ("environments", 1, 10**6),

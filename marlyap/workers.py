@@ -7,16 +7,15 @@ import subprocess
 import sys
 import threading
 from argparse import Namespace
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from queue import Queue
 from typing import Any
 
 import jax
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from marlyap.errors import UserError
 from marlyap.fit import Diverged, fit
+from marlyap.progress import show
 from marlyap.run import Run
 
 
@@ -69,9 +68,9 @@ def train_all(runs: list[Run], args: Namespace) -> int:
             for event in fit(runs, stop, attempts):
                 print(json.dumps(event), flush=True)
         elif len(runs) == 1 or vmapped:
-            _show(_side_by_side(runs, stop, attempts), runs)
+            show(_side_by_side(runs, stop, attempts), [run.seed for run in runs])
         else:
-            _show(_processes(runs, stop, args), runs)
+            show(_processes(runs, stop, args), [run.seed for run in runs])
     if stop.signal:
         where = " ".join(str(run.directory) for run in runs)
         print(f"Saved. Resume with: marlyap train --resume {where}", file=sys.stderr)
@@ -97,42 +96,6 @@ def _side_by_side(runs: list[Run], stop: Stop, attempts: int) -> Iterator[dict[s
         failed += [says[run.seed] for run in group if not run.finished and run.seed in says]
     if failed:
         raise UserError(failed[0])
-
-
-def _show(events: Iterable[dict[str, Any]], runs: list[Run]) -> None:
-    """A bar for each seed: steps, speed, return, success, time left."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=24),
-        TextColumn("{task.percentage:>3.0f} %"),
-        TextColumn("{task.fields[text]}"),
-        TimeRemainingColumn(compact=True),
-    )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        bars = {
-            r.seed: progress.add_task(f"seed {r.seed}", total=None, text="compiling") for r in runs
-        }
-        seen: dict[int, dict[str, Any]] = {}
-        for e in events:
-            if "warning" in e or "diverged" in e:
-                what = e.get("warning") or e["says"]
-                console.print(f"seed {e['seed']}: {what}", highlight=False)
-                continue
-            first = seen.setdefault(e["seed"], e)
-            if e["steps"] < first["steps"]:  # another run of the same seed
-                first = seen[e["seed"]] = e
-            seconds = e["seconds"] - first["seconds"]
-            speed = f"{(e['steps'] - first['steps']) / seconds:,.0f}/s  " if seconds > 0 else ""
-            success = e.get("success", first.get("last"))
-            first["last"] = success
-            text = f"{e['steps']:,} steps  {speed}return {e['return']:.2f}"
-            text += f"  success {100 * success:.1f} %" if success is not None else ""
-            progress.update(
-                bars[e["seed"]], total=e["iterations"], completed=e["iteration"], text=text
-            )
-            if not console.is_terminal and "success" in e:
-                console.print(f"seed {e['seed']}: {text}", highlight=False)
 
 
 def _processes(runs: list[Run], stop: Stop, args: Namespace) -> Iterator[dict[str, Any]]:

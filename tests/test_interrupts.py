@@ -59,7 +59,7 @@ def ends_in_one_line(argv, seconds):
 
 
 @pytest.mark.parametrize(
-    ("verb", "seconds"), [("evaluate", 0.3), ("train", 0.6), ("certify", 8.0), ("check-task", 3.0)]
+    ("verb", "seconds"), [("evaluate", 0.3), ("train", 0.6), ("certify", 5.0), ("check-task", 3.0)]
 )
 def test_an_interrupt_is_one_line(run, tmp_path, verb, seconds):
     """While Python starts, JAX is imported, XLA compiles, and rollouts run."""
