@@ -22,7 +22,7 @@ import jax
 
 from marlyap import MASAC, Lyapunov, Rendezvous, Schedule, Trainer
 from marlyap.algorithms import PRESETS
-from marlyap.cli import cache_directory
+from marlyap.cache import cache_directory
 
 
 PACKAGES = ("torchrl==0.11.1", "vmas==1.5.2", "hydra-core", "omegaconf", "tqdm")

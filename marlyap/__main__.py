@@ -1,5 +1,7 @@
-from marlyap.cli import main
+"""`python -m marlyap`."""
+
+from marlyap.cli import program
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    program()

@@ -2,12 +2,15 @@
 
 import dataclasses
 import json
+import re
 import secrets
 import shlex
+import shutil
 import sys
 import time
 from argparse import Namespace
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, cast
 
@@ -25,7 +28,7 @@ from marlyap.certificates.safety import has_rules
 from marlyap.certify import certify, save
 from marlyap.conformance import conformance
 from marlyap.controllers import CONTROLLERS
-from marlyap.errors import UserError
+from marlyap.errors import UserError, within
 from marlyap.evaluation import RESTS, evaluate
 from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import cost_sum
@@ -35,7 +38,7 @@ from marlyap.run import Run, expand
 from marlyap.seeds import stream
 from marlyap.subject import asked, refuse_all_but_task, subject
 from marlyap.tasks import TASKS
-from marlyap.trainer import Trainer, schedule_for
+from marlyap.trainer import SCHEDULES, Trainer, schedule_for
 from marlyap.workers import train_all
 
 
@@ -52,19 +55,47 @@ def train(args: Namespace, overrides: Overrides) -> Result:
         for option in [k for k, v in given.items() if v is not None]:
             raise UserError(f"{option}: a run that is resumed goes on as it is; leave it out.")
         args.task, args.algorithm = args.task or args.own_task, args.algorithm or args.own_algorithm
-        game, algorithm = own_code(args, overrides)
-        runs = [Run.open(d, game, algorithm) for d in expand(args.resume)]
+        if overrides:
+            raise UserError(f"--{next(iter(overrides))}: a run that is resumed keeps its settings.")
+        game = config.load(args.task, AbstractGame) if args.task else None
+        rule = config.load(args.algorithm, AbstractAlgorithm) if args.algorithm else None
+        runs = [Run.open(d, game, rule) for d in expand(args.resume)]
+        for run in runs:
+            for warning in run.warnings:
+                say(f"warning: {warning}")
+        readable(runs)
     else:
         if not args.task or not args.algorithm:
             raise UserError("train: name a task and an algorithm, as in train rendezvous masac.")
         runs = create(args, overrides)
-    code = train_all(runs, args)
+    code = trained(runs, args, new=not args.resume)
     state = [
         {"run": str(r.directory), "seed": r.seed, "steps": r.steps_done, "finished": r.finished}
         for r in runs
     ]
     say(f"{'Done' if code == 0 else 'Stopped'}: {', '.join(str(r.directory) for r in runs)}")
     return {"runs": state}, code
+
+
+def trained(runs: list[Run], args: Namespace, new: bool) -> int:
+    """Train; a new run in which training could not begin leaves no directory behind."""
+    try:
+        return train_all(runs, args)
+    except BaseException:
+        for run in runs if new else ():
+            if run.untouched:
+                shutil.rmtree(run.directory, ignore_errors=True)
+                with suppress(OSError):  # as when other runs are in it
+                    run.directory.parent.rmdir()
+        raise
+
+
+def readable(runs: list[Run]) -> None:
+    """Raise UserError where a finished run has no sound checkpoint left; nothing would train it."""
+    for run in runs:
+        if run.finished:
+            for warning in run.checkpoints.latest().warnings:
+                say(f"warning: {warning}")
 
 
 def create(args: Namespace, overrides: Overrides) -> list[Run]:
@@ -110,10 +141,11 @@ def own_code(
 
 def seeds(words: list[str]) -> list[int]:
     """The seeds asked for: whole numbers, each once."""
-    try:
-        numbers = [int(w) for word in words for w in word.split(",")]
-    except ValueError:
-        raise UserError(f"seeds: {' '.join(words)} are not all whole numbers.") from None
+    each = [w for word in words for w in word.split(",")]
+    for word in each:
+        if not re.fullmatch(r"[+-]?\d+", word.strip()):
+            raise UserError(f"seeds: '{word}' is not a whole number.")
+    numbers = [int(w) for w in each]
     if len(set(numbers)) != len(numbers):
         raise UserError(f"seeds: {' '.join(words)} names a seed twice.")
     if not all(0 <= n < 2**31 for n in numbers):
@@ -327,32 +359,56 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
 
 
 def recheck_certificate(args: Namespace, overrides: Overrides) -> Result:
-    """`recheck`: reject the certificate or confirm its figures."""
-    tell = (lambda name: None) if args.json else (lambda name: print(f"{name}: agrees", flush=True))
+    """`recheck`: reject the certificate, or say of each verdict that it agrees.
+
+    The exit code is 0 only if every verdict was derived again, and 1 where some could not be.
+    """
+
+    def tell(name: str, verdict: dict[str, Any]) -> None:
+        if not args.json:
+            mark = "holds" if verdict["holds"] else "does not hold"
+            print(f"{name} agrees: {verdict['claim']}: {mark}.", flush=True)
+
     result = recheck(args.certificate, tell)
+    done, left = len(result["rechecked"]), result["not_rechecked"]
     if not args.json:
-        print(f"{args.certificate}: derived again, {len(result['rechecked'])} certificates agree.")
-        if result["not_rechecked"]:
-            print(f"Not looked at: {', '.join(result['not_rechecked'])}.")
-    return result, 0
+        for name, why in left.items():
+            print(f"NOT CHECKED: {name}: {why}.")
+        print(
+            f"{args.certificate}: {done} of {done + len(left)} verdicts were derived again; ",
+            end="",
+        )
+        print("the file as a whole is not confirmed." if left else "all agree.")
+    return result, int(not result["agrees"])
 
 
 def check_task(args: Namespace, overrides: Overrides) -> Result:
     """`check-task`: one finding for every law; exit code 1 if one is broken."""
-    game, _ = own_code(Namespace(task=args.task, algorithm=None), overrides)
-    assert game is not None
+    game = asked(args.task, overrides)
+    within("seed", args.seed, 0, 2**31 - 1)
     found = conformance(game, args.seed)
+    broken = [f.law for f in found if f.faults]
+    skipped = [f.law for f in found if f.faults is None]
     if not args.json:
-        table = Table(title=args.task, title_justify="left", show_header=False)
+        table = Table(title=escape(args.task), title_justify="left", show_header=False)
         for f in found:
-            mark = "not looked at" if f.faults is None else "broken" if f.faults else "kept"
+            if f.faults is None:
+                continue
             figures = ", ".join(f"{name} {value:.3g}" for name, value in f.figures.items())
-            text = "\n".join(f.faults or ()) or f.says + (f" ({figures})" if figures else "")
-            table.add_row(f.law, mark, escape(text))
+            text = "\n".join(f.faults) or f.says + (f" ({figures})" if figures else "")
+            table.add_row(f.law, "broken" if f.faults else "kept", escape(text))
+        if skipped:
+            rest = f"{len(skipped)} laws need sound shapes: {', '.join(skipped)}"
+            table.add_row("", "skipped", rest)
         Console().print(table)
-    broken = any(f.faults for f in found)
+        print(
+            f"{args.task}: {len(found) - len(broken) - len(skipped)} of {len(found)} laws kept",
+            end="",
+        )
+        print(f", {len(skipped)} skipped" if skipped else "", end="")
+        print(f"; broken: {', '.join(broken)}." if broken else ".")
     laws = {f.law: {"says": f.says, "faults": f.faults, "figures": f.figures} for f in found}
-    return {"task": args.task, "passes": not broken, "laws": laws}, int(broken)
+    return {"task": args.task, "passes": not broken, "laws": laws}, int(bool(broken))
 
 
 def report(args: Namespace, overrides: Overrides) -> Result:
@@ -414,17 +470,21 @@ def watch(args: Namespace, overrides: Overrides) -> Result:
 
 def listing(args: Namespace, overrides: Overrides) -> Result:
     """What there is, or the fields of one of them."""
+    if overrides:
+        raise UserError(f"--{next(iter(overrides))}: list shows what there is; leave it out.")
     if args.name:
         return fields_of(args.name, args.json), 0
     families: dict[str, dict[str, Any]] = {
         "tasks": TASKS,
         "algorithms": ALGORITHMS,
         "controllers": CONTROLLERS,
+        "certificates": CERTIFICATES,
     }
     result = {
         title: {name: summary(thing) for name, thing in family.items()}
         for title, family in families.items()
     }
+    result["presets"] = dict(PRESET_NOTES)
     if not args.json:
         console = Console()
         for title, members in result.items():
@@ -432,9 +492,16 @@ def listing(args: Namespace, overrides: Overrides) -> Result:
                 title=title, title_justify="left", show_header=False, box=None, padding=(0, 2)
             )
             for name, text in members.items():
-                table.add_row(f"[bold]{name}[/]", text)
+                table.add_row(f"[bold]{escape(name)}[/]", escape(text))
             console.print(table, "")
+        console.print("`marlyap list NAME` shows the fields of each, and `marlyap list schedule`.")
     return result, 0
+
+
+PRESET_NOTES = {
+    "tuned": "what learns best here; every algorithm and schedule as listed",
+    "paper": "section 4 of the paper: plain networks, one environment, 100,000 steps",
+}
 
 
 def summary(thing: Any) -> str:
@@ -463,28 +530,46 @@ def changes(thing: Any, prefix: str = "") -> list[str]:
 
 
 def fields_of(name: str, quiet: bool) -> dict[str, Any]:
-    """Every field of a task or algorithm with its value, for overriding."""
-    family = AbstractGame if name in TASKS else AbstractAlgorithm
-    if name not in TASKS and name not in ALGORITHMS:
-        raise UserError(
-            f"name: there is no task or algorithm '{name}'; "
-            f"{config.suggest(name, [*TASKS, *ALGORITHMS])}"
-        )
-    rows = config.describe(config.load(name, family), config.WORDS[family])
-    table = Table(title=name, title_justify="left")
-    for head in ("option", "value", "meaning"):
-        table.add_column(head)
-    for option, value, note in rows:
-        table.add_row(f"--{option}", value, note)
+    """Every field of what `list` names, or of path/to/file.py:Name, with value and meaning."""
+    rows = rows_of(name)
+    table = Table(title=escape(name), title_justify="left", title_style="bold")
+    table.add_column("option", overflow="fold", min_width=max(len(row[0]) for row in rows))
+    table.add_column("value", overflow="fold")
+    table.add_column("meaning", overflow="fold")
+    for row in rows:
+        table.add_row(*map(escape, row))
     if not quiet:
         Console().print(table)
-    return {f"--{option}": {"value": value, "meaning": note} for option, value, note in rows}
+    return {option: {"value": value, "meaning": note} for option, value, note in rows}
+
+
+def rows_of(name: str) -> list[tuple[str, str, str]]:
+    """(option or field, value, meaning) of whatever has this name."""
+    dotted = lambda obj, part: [(f"--{o}", v, m) for o, v, m in config.describe(obj, part)]
+    for table, family in ((TASKS, AbstractGame), (ALGORITHMS, AbstractAlgorithm)):
+        if name in table:
+            return dotted(table[name], config.WORDS[family])
+    if name in ("schedule", *PRESETS):
+        return dotted(SCHEDULES["tuned" if name == "schedule" else name], "schedule")
+    if name in CONTROLLERS:
+        return config.describe_class(CONTROLLERS[name]) or [("(no gains)", "", "")]
+    if name in CERTIFICATES:
+        return [(o.lstrip("."), v, m) for o, v, m in config.describe(CERTIFICATES[name], "")]
+    if ":" not in name and not name.endswith(".py"):
+        there = [*TASKS, *ALGORITHMS, *CONTROLLERS, *CERTIFICATES, *PRESETS, "schedule"]
+        raise UserError(f"name: nothing is called '{name}'; {config.suggest(name, there)}")
+    try:
+        return dotted(config.load(name, AbstractGame), "task")
+    except config.NotOfThatKind:
+        return dotted(config.load(name, AbstractAlgorithm), "algorithm")
 
 
 def demo(args: Namespace, overrides: Overrides) -> Result:
     """Train, evaluate and report the main task; what is trained already is kept."""
     start = time.monotonic()
     names = [args.out / f"seed{s}" for s in seeds(args.seeds)]
+    for place in names:
+        Run.outside(place)
     job = Namespace(
         task="rendezvous",
         algorithm="masac-lyapunov",
@@ -506,10 +591,10 @@ def demo(args: Namespace, overrides: Overrides) -> Result:
                 f"seeds: {missing[0]} is not there beside {there[0]}; train all anew by --again."
             )
         runs = [Run.open(d) for d in names]
-        say(f"{args.out} holds these runs; going on with them. To train anew: demo --again")
+        say(f"{args.out} holds these runs, which are used again; to train anew: demo --again")
     else:
         runs = create(job, overrides)
-    code = train_all([r for r in runs if not r.finished], job)
+    code = trained([r for r in runs if not r.finished], job, new=not there or args.again)
     if code:
         return None, code
     out = args.out / "report.html"

@@ -9,10 +9,12 @@ import difflib
 import hashlib
 import importlib.util
 import inspect
+import re
 import sys
 import types
 import typing
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -23,7 +25,7 @@ from marlyap.algorithms import ALGORITHMS
 from marlyap.constraint import AbstractConstraint
 from marlyap.constraints import CONSTRAINTS
 from marlyap.dynamics import DYNAMICS, AbstractDynamics
-from marlyap.errors import UserError
+from marlyap.errors import UserError, first_line, raised_at, whole
 from marlyap.game import AbstractGame
 from marlyap.tasks import TASKS
 from marlyap.trainer import Schedule
@@ -41,6 +43,10 @@ WORDS = {AbstractGame: "task", AbstractAlgorithm: "algorithm"}
 
 class UnknownCode(UserError):
     """A record names a class that is neither marlyap's nor named by the user."""
+
+
+class NotOfThatKind(UserError):
+    """The file that was named defines no such task or algorithm."""
 
 
 def known() -> dict[str, type]:
@@ -65,14 +71,46 @@ def load(name: str, family: type[T]) -> T:
     if name in table:
         return table[name]
     if ":" not in name:
+        if name.endswith(".py") and Path(name).is_file():
+            classes = re.findall(r"^class (\w+)", Path(name).read_text(errors="replace"), re.M)
+            hint = " or ".join(f"{name}:{c}" for c in classes) or f"{name}:Name"
+            raise UserError(f"{word}: {name} needs the name of the class, as in {hint}.")
         raise UserError(f"{word}: no {word} is called '{name}'; {suggest(name, table)}")
     path, _, attribute = name.rpartition(":")
-    thing = getattr(_module(Path(path), word), attribute, None)
+    module = _module(Path(path), word)
+    thing = getattr(module, attribute, None)
     if inspect.isclass(thing) and issubclass(thing, family):
         thing = _construct(thing, {}, name)
     if not isinstance(thing, family):
-        raise UserError(f"{word}: {path} defines no {word} called '{attribute}'.")
+        there = [k for k, v in vars(module).items() if _is_of(v, family) and not _ours(_class(v))]
+        hint = f"; {suggest(attribute, there)}" if there else "."
+        raise NotOfThatKind(f"{word}: {path} defines no {word} called '{attribute}'{hint}")
+    for cls in own_classes(thing).values():
+        _annotated(cls)
     return thing
+
+
+def _class(value: Any) -> type:
+    return value if inspect.isclass(value) else type(value)
+
+
+def _is_of(value: Any, family: type) -> bool:
+    """Whether it is an object of the family, or a class that makes one."""
+    return issubclass(_class(value), family)
+
+
+def _annotated(cls: type) -> None:
+    """Raise UserError for what looks like a field of a user's class and is none."""
+    for base in cls.__mro__:
+        declared = vars(base).get("__annotations__", {})
+        for name, value in vars(base).items() if not _ours(base) and base is not object else ():
+            plain = isinstance(value, bool | int | float | str | tuple | eqx.Module)
+            if plain and name not in declared and not name.startswith("_"):
+                kind = type(value).__name__
+                shown = repr(value) if not isinstance(value, eqx.Module) else f"{kind}()"
+                raise UserError(
+                    f"{cls.__name__}: {name} = {shown} needs a type: {name}: {kind} = {shown}."
+                )
 
 
 def override(obj: T, path: str, text: str) -> T:
@@ -80,19 +118,20 @@ def override(obj: T, path: str, text: str) -> T:
 
     Raises UserError for an unknown field (with a suggestion) or a value of the wrong kind.
     """
-    return _override(obj, path.split("."), text, path)
+    return _set(obj, {tuple(path.split(".")): text}, ())
 
 
 def override_all(parts: Mapping[str, Any], texts: Mapping[str, str]) -> dict[str, Any]:
-    """The parts with every `part.field` set; an object is chosen before its fields are set.
+    """The parts with every `part.field` set, whatever the order.
 
     Raises UserError as `override` does, the option's full name before it.
     """
     changed = dict(parts)
-    for path in sorted(texts, key=lambda path: path.count(".")):
-        part, _, field = path.partition(".")
+    for part in dict.fromkeys(path.partition(".")[0] for path in texts):
+        split = {tuple(path.split(".")): text for path, text in texts.items()}
+        own = {path[1:]: text for path, text in split.items() if path[0] == part}
         try:
-            changed[part] = override(changed[part], field, texts[path])
+            changed[part] = _set(changed[part], own, ())
         except UserError as error:
             raise UserError(f"--{part}.{error}") from None
     return changed
@@ -170,7 +209,10 @@ def build(data: Any, allowed: Mapping[str, type], where: str) -> Any:
         raise UserError(f"{where}: expected an object with a 'kind'; the file may be damaged.")
     cls = allowed.get(data["kind"])
     if cls is None:
-        raise UnknownCode(f"{where}: '{data['kind']}' is not part of marlyap")
+        raise UnknownCode(
+            f"{where}: '{data['kind']}' is not part of marlyap; if it is your own code, name it "
+            f"with --{where.split('.')[0]} path/to/file.py:{data['kind']}."
+        )
     hints, values = _hints(cls), {}
     for name, value in data.items():
         if name == "kind":
@@ -192,12 +234,22 @@ def build(data: Any, allowed: Mapping[str, type], where: str) -> Any:
 
 def describe(obj: Any, prefix: str) -> list[tuple[str, str, str]]:
     """(option, value, comment) for every field, nested ones too; comments come from the source."""
-    rows, notes = [], _comments(type(obj))
+    rows, notes, hints = [], _comments(type(obj)), _hints(type(obj))
     for name, value in fields(obj).items():
-        rows.append((f"{prefix}.{name}", show(value), notes.get(name, "")))
+        note, choices = notes.get(name, ""), _choices(hints[name])
+        if choices:
+            note = f"{note}{'; ' * bool(note)}one of {', '.join(choices)}"
+        rows.append((f"{prefix}.{name}", show(value), note))
         if isinstance(value, eqx.Module):
             rows += describe(value, f"{prefix}.{name}")
     return rows
+
+
+def describe_class(cls: type) -> list[tuple[str, str, str]]:
+    """(field, value, comment) for every field of a class that has a default."""
+    notes, missing = _comments(cls), dataclasses.MISSING
+    given = [f for f in dataclasses.fields(cls) if f.init and f.default is not missing]
+    return [(f.name, show(f.default), notes.get(f.name, "")) for f in given]
 
 
 def show(value: Any) -> str:
@@ -208,17 +260,23 @@ def show(value: Any) -> str:
     return ",".join(map(show, value)) if isinstance(value, tuple) else str(value)
 
 
-def _override(obj: T, path: list[str], text: str, full: str) -> T:
-    name, rest = path[0], path[1:]
+def _set(obj: T, texts: dict[tuple[str, ...], str], where: tuple[str, ...]) -> T:
+    """`obj` with all of these fields set at once, so that their order cannot matter."""
     have = fields(obj) if dataclasses.is_dataclass(obj) else {}
-    if name not in have:
-        raise UserError(f"{full}: there is no field '{name}'; {suggest(name, have)}")
-    if rest:
-        value = _override(have[name], rest, text, full)
-    else:
-        value = _parse(text, _hints(type(obj))[name], full)
-    parents = full.split(".")[: -len(path)]
-    return _construct(type(obj), have | {name: value}, ".".join(parents))
+    values = dict(have)
+    for path in sorted(texts, key=len):  # an object is chosen before its fields are set
+        name, full = path[0], (*where, path[0])
+        if name not in have:
+            hint = suggest(name, have)
+            if where and not have:
+                hint = f"{'.'.join(where)} is {show(obj)}, which has none; set that too."
+            raise UserError(f"{'.'.join((*where, *path))}: there is no field '{name}'; {hint}")
+        if len(path) == 1:
+            values[name] = _parse(texts[path], _hints(type(obj))[name], ".".join(full))
+    for name in dict.fromkeys(path[0] for path in texts if len(path) > 1):
+        deeper = {path[1:]: text for path, text in texts.items() if path[0] == name and path[1:]}
+        values[name] = _set(values[name], deeper, (*where, name))
+    return _construct(type(obj), values, ".".join(where))
 
 
 def _construct(cls: type[T], values: dict[str, Any], where: str) -> T:
@@ -227,7 +285,9 @@ def _construct(cls: type[T], values: dict[str, Any], where: str) -> T:
     except UserError as error:
         raise UserError(f"{where}.{error}" if where and ":" not in where else str(error)) from None
     except Exception as error:  # whatever the constructor of a user's class may raise
-        raise UserError(f"{where or cls.__name__}: {error}.") from error
+        place = raised_at(error)
+        said = f"{place}: {first_line(error)}" if place else f"{error}"
+        raise UserError(f"{where or cls.__name__}: {said}.") from error
 
 
 def _parse(text: str, hint: Any, where: str) -> Any:
@@ -245,8 +305,10 @@ def _parse_as(text: str, kind: Any) -> Any:
         return None
     if kind is bool and text.lower() in ("true", "false", "yes", "no", "1", "0"):
         return text.lower() in ("true", "yes", "1")
-    if kind in (int, float):
-        return kind(text.replace("_", "")) if kind is int else _finite(float(text))
+    if kind is int:
+        return whole(text)
+    if kind is float:
+        return _finite(float(text))
     if kind is str:
         return text
     if typing.get_origin(kind) is Literal and text in typing.get_args(kind):
@@ -312,14 +374,28 @@ def _hints(cls: type) -> dict[str, Any]:
     return {f.name: hints[f.name] for f in dataclasses.fields(cls) if f.init}
 
 
+def _choices(hint: Any) -> list[str]:
+    """The words a field may be set to, where only some are known."""
+    found: list[str] = []
+    for kind in _alternatives(hint):
+        found += map(str, typing.get_args(kind)) if typing.get_origin(kind) is Literal else ()
+        found += FAMILIES.get(kind, ())
+    return found
+
+
 def _comments(cls: type) -> dict[str, str]:
-    """The comment behind each field, from the source of the class where it can be read."""
-    try:
-        lines = inspect.getsource(cls).splitlines()
-    except OSError:
-        return {}
-    pairs = (line.split("#", 1) for line in lines if "#" in line and ":" in line.split("#")[0])
-    return {code.split(":")[0].strip(): note.strip() for code, note in pairs}
+    """The comment behind each field, of base classes too, from the source where it can be read."""
+    found: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        lines: list[str] = []
+        if base.__module__ != "builtins" and dataclasses.is_dataclass(base):
+            with suppress(OSError, TypeError):
+                lines = inspect.getsource(base).splitlines()
+        for line in lines:
+            code, mark, note = line.partition("#")
+            if mark and (field := re.fullmatch(r"    (\w+):.*", code.rstrip())):
+                found[field[1]] = note.strip()
+    return found
 
 
 def _module(path: Path, word: str) -> types.ModuleType:
@@ -340,5 +416,8 @@ def _module(path: Path, word: str) -> types.ModuleType:
         del sys.modules[name]
         if isinstance(error, UserError) or not isinstance(error, (Exception, SystemExit)):
             raise
-        raise UserError(f"{word}: {path} could not be loaded: {error}.") from error
+        place = raised_at(error) or path.name
+        raise UserError(
+            f"{word}: {path} could not be loaded: {place}: {first_line(error)}."
+        ) from error
     return module

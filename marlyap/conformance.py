@@ -5,11 +5,8 @@ every law of `LAWS` on them. PettingZoo's checks, by comparison, look at one ste
 """
 
 import dataclasses
-import sysconfig
-import traceback
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -19,6 +16,7 @@ import numpy as np
 from jaxtyping import Array
 
 from marlyap.controllers import UniformlyRandom
+from marlyap.errors import first_line, raised_at
 from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import at_target
 from marlyap.rollout import rollout
@@ -81,21 +79,10 @@ def _caught(law: Callable[[], Faults]) -> Faults:
 
 
 def _raised(method: str, error: Exception) -> str:
-    lines = str(error).strip().splitlines() or [""]
     traced = isinstance(error, (jax.errors.JAXTypeError, jax.errors.JAXIndexError))
     remedy = "use jnp.where, not if or float()" if traced else "make it return for every state"
-    what = f"{type(error).__name__} ({lines[0].rstrip('.')[:160]})"
-    return f"{method}: it raised {what}{_place(error)}; {remedy}."
-
-
-def _place(error: Exception) -> str:
-    """The last line of the user's own code that the error passed through, if any."""
-    installed = [str(Path(__file__).parent), sysconfig.get_paths()["stdlib"], "<"]
-    for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        name = frame.filename
-        if "site-packages" not in name and not name.startswith(tuple(installed)):
-            return f" at {Path(name).name}:{frame.lineno}"
-    return ""
+    place = f" at {place}" if (place := raised_at(error)) else ""
+    return f"{method}: it raised {first_line(error)}{place}; {remedy}."
 
 
 # --- What is examined -----------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The host loop over compiled iterations: progress, log, checkpoints, stopping in good order."""
+"""The host loop over compiled iterations: progress, log, checkpoints, stopping."""
 
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -23,6 +23,7 @@ from marlyap.run import FROM_TASK, Run, begin
 from marlyap.trainer import Carry, Schedule, Trainer, schedule_for
 
 
+BY_TASK = [f"bad_{name}" for name in (*FROM_TASK, "sign")]
 SHARE = 0.02  # of the training time that checkpoints may take
 PATIENCE = 20.0  # seconds between checkpoints at least
 
@@ -113,15 +114,17 @@ def _together(
             fault = _fault(line)
             if fault and alive[i]:
                 alive[i] = False
-                where = None if fault in FROM_TASK else diagnose(trainer, run.load()[0], done)
+                where = (
+                    None if f"bad_{fault}" in BY_TASK else diagnose(trainer, run.load()[0], done)
+                )
                 says = _advice(fault, line, trainer.game.agents, where) + f" in {run.directory}."
                 faults[run.seed] = Diverged(says)
                 yield {"seed": run.seed, "iteration": done, "diverged": fault, "says": says}
                 if not any(alive):
                     return faults
             if alive[i]:
-                run.log(line)
-                yield line | {"iterations": trainer.iterations}
+                run.log(_told(line))
+                yield _told(line) | {"iterations": trainer.iterations}
         if saved.due():
             saved.save(runs, carry, alive, seconds)
     saved.save(runs, carry, alive, before + time.monotonic() - clock)
@@ -188,9 +191,9 @@ def train(
         line = _line(trainer, seed, done, time.monotonic() - clock, rows, 0)
         if fault := _fault(line):
             raise Diverged(_advice(fault, line, game.agents) + ".")
-        history.append(line)
+        history.append(_told(line))
         if on_iteration:
-            on_iteration(line)
+            on_iteration(history[-1])
     last = _row(carry, 0)
     return Trained(last.best, algorithm.lyapunov(last.learner), game, history)
 
@@ -270,23 +273,31 @@ def _line(
     } | {name: float(values[i]) for name, values in rows.items()}
 
 
+def _told(line: dict[str, Any]) -> dict[str, Any]:
+    """The line without the fields that find faults: there was none, or training had stopped."""
+    return {k: v for k, v in line.items() if not k.startswith("bad_") or v >= 0}
+
+
 def _fault(line: dict[str, Any]) -> str | None:
-    """What is not finite: what the task gave before what the algorithm made of it."""
-    for name in FROM_TASK:
-        if line.get(f"bad_{name}", -1) >= 0:
-            return name
+    """What is wrong: what the task gave before what the algorithm made of it."""
+    for name in BY_TASK:
+        if line.get(name, -1) >= 0:
+            return name.removeprefix("bad_")
     losses = (name for name, value in line.items() if not np.isfinite(value))
     others = (name for name in ("action", "learner") if line.get(f"bad_{name}", -1) >= 0)
     return next(chain(losses, others), None)
 
 
 def _advice(fault: str, line: dict[str, Any], agents: int, where: str | None = None) -> str:
-    by_task = fault in FROM_TASK
-    text = f"{fault}: {'the task returned' if by_task else 'training made'} a number that is not "
-    text += f"finite in iteration {line['iteration']} (seed {line['seed']})"
+    by_task, what = f"bad_{fault}" in BY_TASK, "a number that is not finite"
+    if fault == "sign":
+        what = "a negative number"
+    text = f"{'cost' if fault == 'sign' else fault}: "
+    text += f"{'the task returned' if by_task else 'training made'} {what} "
+    text += f"in iteration {line['iteration']} (seed {line['seed']})"
     if by_task:
         step, agent = divmod(int(line[f"bad_{fault}"]), agents)
         text += f", first for agent {agent} at step {step}"
     text += f", first in {where}" if where else ""
-    mend = "mend the task" if by_task else "lower the learning rates"
-    return f"{text}; {mend} and go on from the last checkpoint"
+    remedy = "correct the task" if by_task else "lower the learning rates"
+    return f"{text}; {remedy} and resume from the last checkpoint"

@@ -10,6 +10,7 @@ import json
 import shutil
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,14 +23,16 @@ from jaxtyping import PyTree
 
 from marlyap import config, programs, seeds, store
 from marlyap.algorithm import AbstractAlgorithm
-from marlyap.errors import UserError
+from marlyap.conformance import shapes
+from marlyap.errors import UserError, defined_at
 from marlyap.game import AbstractGame
 from marlyap.nets import LyapunovNet, NormNet
 from marlyap.rollout import Decentralised, Policy, first_fault
-from marlyap.trainer import Carry, Schedule, Trainer, shape
+from marlyap.trainer import Carry, Schedule, Trainer, first_negative, shape
 
 
 SCHEMA = 1
+NEGATIVE = "negative cost"
 FROM_TASK = ("obs", "features", "reward", "cost")  # numbers that the task answers for
 
 
@@ -52,7 +55,12 @@ class Run:
         names: dict[str, str],
         force: bool = False,
     ) -> "Run":
-        """A new run directory. Raises UserError if it exists, unless `force` empties it."""
+        """A new run directory.
+
+        Raises UserError if it exists, unless `force` empties it, or if the task returns a wrong
+        shape.
+        """
+        sound(trainer.game)
         cls.vacant(directory, force)
         if directory.exists():
             with store.lock(directory):  # not while another process trains in it
@@ -82,6 +90,7 @@ class Run:
     @staticmethod
     def vacant(directory: Path, force: bool = False) -> None:
         """Raise UserError unless a run can be made here (with `force`, in place of another)."""
+        Run.outside(directory)
         try:
             if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):
                 return
@@ -94,6 +103,16 @@ class Run:
             )
         if not (directory / "run.json").is_file():
             raise UserError(f"out: {directory} is not a run; --force would destroy it.")
+
+    @staticmethod
+    def outside(directory: Path) -> None:
+        """Raise UserError if this is inside another run's directory."""
+        for above in directory.resolve().parents:
+            with suppress(OSError):
+                if (above / "run.json").is_file():
+                    raise UserError(
+                        f"out: {directory} is inside the run {above}; choose another directory."
+                    )
 
     @classmethod
     def open(
@@ -133,8 +152,9 @@ class Run:
                 made = config.build(about[part], allowed, part)
             except config.UnknownCode as error:
                 file = typed if ":" in typed else f"path/to/file.py:{about[part]['kind']}"
+                what = str(error).partition("; ")[0]
                 raise UserError(
-                    f"{error}; if it is your own code, name it with --{part} {file}."
+                    f"{what}; if it is your own code, name it with --{part} {file}."
                 ) from None
             now = config.code_of(made, typed)
             if now and code["sha256"] not in (None, now["sha256"]):
@@ -145,6 +165,12 @@ class Run:
             if not isinstance(part, family):
                 raise UserError(f"run: {where} has a {type(part).__name__} in the wrong place.")
         return cls(directory, Trainer(*parts), about["seed"], names, tuple(warnings))
+
+    @property
+    def untouched(self) -> bool:
+        """Whether training has left nothing here yet."""
+        log = self.directory / "log.jsonl"
+        return not self.checkpoints.steps() and not (log.exists() and log.stat().st_size)
 
     @property
     def game(self) -> AbstractGame:
@@ -265,20 +291,32 @@ def begin(trainer: Trainer, seed: int) -> Carry:
     key = seeds.stream(seed, "train")
     like = lambda: eqx.filter_eval_shape(trainer.begin, key)
     carry, faults = programs.compiled(_begin, trainer, key, like)(key)
-    for name in FROM_TASK:
-        at = int(faults[name])
-        if at >= 0:
-            step, agent = divmod(at, trainer.game.agents)
+    for name, at in faults.items():
+        if int(at) >= 0:
+            step, agent = divmod(int(at), trainer.game.agents)
+            what = "a negative number" if name == NEGATIVE else "a number that is not finite"
             raise UserError(
-                f"{name}: the task returned a number that is not finite in the warm-up "
-                f"(seed {seed}), first for agent {agent} at step {step}; mend the task."
+                f"{name.split()[-1]}: the task returned {what} in the warm-up (seed {seed}), first "
+                f"for agent {agent} at step {step}; correct the task (check-task says more)."
             )
     return carry
 
 
 def _begin(trainer: Trainer, key: jax.Array) -> tuple[Carry, dict[str, Any]]:
     carry = trainer.begin(key)
-    return carry, {name: first_fault(getattr(carry.memory.episodes, name)) for name in FROM_TASK}
+    played = carry.memory.episodes
+    faults = {name: first_fault(getattr(played, name)) for name in FROM_TASK}
+    return carry, faults | {NEGATIVE: first_negative(played.cost)}
+
+
+def sound(game: AbstractGame) -> None:
+    """Raise UserError for what a task returns in a wrong shape or type, or where it raises.
+
+    Shapes alone are computed. `marlyap check-task` says more.
+    """
+    for fault in shapes(game):
+        place = defined_at(game, fault.partition(":")[0]) if " it raised " not in fault else None
+        raise UserError(f"task: {f'{place}: ' if place else ''}{fault}")
 
 
 def expand(paths: Iterable[Path]) -> list[Path]:

@@ -64,6 +64,9 @@ Arrays = Mapping[str, Any]  # of whatever np.asarray takes, JAX's arrays too
 Table = Mapping[str, Mapping[str, Any]]
 
 
+WRITTEN: list[Path] = []  # what this process has put in place
+
+
 class CorruptError(UserError):
     """What is on the disk is not what was written there."""
 
@@ -216,8 +219,7 @@ def write_text_atomic(path: Path, text: str) -> None:
     """Replace the file by `text`; at every instant the old or the new one is there, whole."""
     with _beside(path) as scratch:
         _write_file(scratch, [text.encode()])
-        os.replace(scratch, path)
-        _sync(path.parent)
+        _replace(scratch, path)
 
 
 def write_bytes_atomic(path: Path, writer: Callable[[BinaryIO], object]) -> None:
@@ -231,8 +233,7 @@ def write_bytes_atomic(path: Path, writer: Callable[[BinaryIO], object]) -> None
             writer(file)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(scratch, path)
-        _sync(path.parent)
+        _replace(scratch, path)
 
 
 def read_json(path: Path, limit_bytes: int = JSON_LIMIT) -> Any:
@@ -521,6 +522,12 @@ def _explained(path: Path) -> Iterator[None]:
         raise UserError(f"{path} could not be written ({error.strerror}); {mend}.") from error
 
 
+def _replace(scratch: Path, path: Path) -> None:
+    os.replace(scratch, path)
+    WRITTEN.append(path)
+    _sync(path.parent)
+
+
 def _write_file(path: Path, chunks: Iterable[Any]) -> None:
     with open(path, "xb") as file:
         for chunk in chunks:
@@ -554,6 +561,7 @@ def _install(scratch: Path, directory: Path) -> None:
         with suppress(FileNotFoundError):
             os.rename(directory, old)
         os.rename(scratch, directory)
+        WRITTEN.append(directory)
     except BaseException:
         with suppress(OSError):
             os.rename(old, directory)

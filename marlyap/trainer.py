@@ -6,7 +6,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from marlyap.algorithm import AbstractAlgorithm, AbstractModelBased, AbstractOffPolicy
 from marlyap.devices import gathered, spread
@@ -69,6 +69,11 @@ class Carry(eqx.Module):
     iteration: Int[Array, ""]
     best: Policy  # of those looked at, the one with the highest score
     score: Scalar
+
+
+def first_negative(cost: Float[Array, "episode time agent"]) -> Int[Array, ""]:
+    """step * agents + agent of the first cost below 0, beyond rounding; -1 where there is none."""
+    return first_fault(jnp.where(cost < -1e-6, jnp.nan, 0.0))
 
 
 def shape(game: AbstractGame) -> Shape:
@@ -139,6 +144,7 @@ class Trainer(eqx.Module):
             info["return"] = jnp.mean(jnp.sum(jnp.mean(new.reward, axis=2), axis=1))
             for name in ("obs", "features", "action", "reward", "cost"):
                 info[f"bad_{name}"] = first_fault(getattr(new, name))
+            info["bad_sign"] = first_negative(new.cost)
         numbers = jax.tree.leaves(eqx.filter(learner, eqx.is_inexact_array))
         # how many are not finite, less 1: negative where all is well, as above
         bad = jnp.stack([jnp.sum(~jnp.isfinite(x)) for x in numbers])

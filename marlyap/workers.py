@@ -24,7 +24,7 @@ ATTEMPTS = 3  # at what is not finite, when it is to be rolled back
 
 
 class Stop:
-    """Remembers the first signal, so that the loop ends in good order; the second ends at once."""
+    """Remembers the first signal, so that the loop can save and end; the second ends at once."""
 
     def __init__(self):
         self.signal = 0
@@ -61,11 +61,10 @@ def train_all(runs: list[Run], args: Namespace) -> int:
     runs = [run for run in runs if not run.finished]
     if not runs:
         return 0
-    vmapped = args.parallel == "vmap" or (
-        args.parallel == "auto" and jax.default_backend() != "cpu"
-    )
     attempts = ATTEMPTS if getattr(args, "on_nan", "stop") == "rollback" else 1
     with Stop() as stop:
+        on_cpu = jax.default_backend() == "cpu"
+        vmapped = args.parallel == "vmap" or (args.parallel == "auto" and not on_cpu)
         if args.worker:
             for event in fit(runs, stop, attempts):
                 print(json.dumps(event), flush=True)
@@ -75,7 +74,7 @@ def train_all(runs: list[Run], args: Namespace) -> int:
             _show(_processes(runs, stop, args), runs)
     if stop.signal:
         where = " ".join(str(run.directory) for run in runs)
-        print(f"Saved. Go on with: marlyap train --resume {where}", file=sys.stderr)
+        print(f"Saved. Resume with: marlyap train --resume {where}", file=sys.stderr)
     return stop.code
 
 
@@ -159,11 +158,13 @@ def _processes(runs: list[Run], stop: Stop, args: Namespace) -> Iterator[dict[st
         code = child.wait()
         if code in (130, 143) and not stop():
             failed.append(
-                f"{run.directory}: its process was stopped from outside; go on with train --resume."
+                f"{run.directory}: its process was stopped from outside; resume by train --resume."
             )
         elif code not in (0, 130, 143):  # the other seeds go on
             said = child.stderr.read().strip().removeprefix("marlyap: ") if child.stderr else ""
-            ended = f"{run.directory}: its process ended with code {code}; train --resume goes on."
+            ended = (
+                f"{run.directory}: its process ended with code {code}; resume it by train --resume."
+            )
             failed.append(said.splitlines()[-1] if said else ended)
     if failed:
         raise UserError(failed[0])

@@ -436,14 +436,14 @@ class Holed(Rendezvous):
 
 def test_the_agent_and_the_step_of_a_bad_reward_are_named():
     game = Holed(agents=2, horizon=4, dynamics=SingleIntegrator())
-    says = r"reward: .* in the warm-up \(seed 0\), first for agent 1 at step 2; mend the task"
+    says = r"reward: .* in the warm-up \(seed 0\), first for agent 1 at step 2; correct the task"
     with pytest.raises(UserError, match=says):
         begin(Trainer(game, trainer("masac").algorithm, SCHEDULE), 0)
     line = {f"bad_{name}": -1.0 for name in ("obs", "features", "cost", "action", "learner")}
     line |= {"seed": 0, "iteration": 7, "J_Q": np.nan, "bad_reward": 5.0}
     assert FIT._fault(line) == "reward"
     says = FIT._advice("reward", line, 2)
-    assert "in iteration 7 (seed 0), first for agent 1 at step 2; mend the task" in says
+    assert "in iteration 7 (seed 0), first for agent 1 at step 2; correct the task" in says
     line["bad_reward"] = -1.0
     assert FIT._fault(line) == "J_Q"
     line["J_Q"] = 0.0

@@ -65,7 +65,7 @@ class MASAC(AbstractOffPolicy):
     critic: Literal["joint", "mean-field"] = "joint"  # of everyone, or of one and the others' mean
     average: float = 1e-3  # how fast the deployed policy follows the actor; 1 is the actor itself
     keep_Q: bool = True  # false drops Q from the policy objective (Han et al. 2020)
-    constraint: AbstractConstraint = Unconstrained()
+    constraint: AbstractConstraint = Unconstrained()  # the Lyapunov condition, if any
 
     def __check_init__(self):
         for name in ("gamma", "tau", "average"):

@@ -67,10 +67,12 @@ class Lyapunov(AbstractConstraint):
     Raises UserError for values out of range and for readings and functions that do not fit.
     """
 
-    reading: Literal["han", "literal", "hinge", "score", "critic"] = "han"
+    reading: Literal["han", "literal", "hinge", "score", "critic"] = (
+        "han"  # how Delta L is read (see above)
+    )
     function: Literal["squares", "norm"] = "squares"  # L(s, a) sum of squares, or V(s) norm-like
     horizon: int = 10  # T of L_target, in steps
-    target: Literal["rollout", "hold_last", "bootstrap", "discounted"] = "rollout"
+    target: Literal["rollout", "hold_last", "bootstrap", "discounted"] = "rollout"  # what L learns
     discount: float = 0.95  # of the target `discounted`
     decrease: float = 0.1  # L must fall by this share of the cost
     weight: float | None = None  # of Delta L in J_pi; None: learnt, in [floor, 1]
@@ -113,7 +115,7 @@ class Lyapunov(AbstractConstraint):
 
     def fits(self, agents):
         for i in self.agents:
-            within("agents", i, 0, agents - 1)
+            within("--algorithm.constraint.agents", i, 0, agents - 1)
 
     def init(self, shape, key):
         make = LyapunovNet if self.function == "squares" else NormNet

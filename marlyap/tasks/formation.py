@@ -29,7 +29,7 @@ class Formation(AbstractGame):
     clearance: float = 0.0  # agents closer than this to another one violate it (m)
     dt: float = 0.1  # s
     horizon: int = 40  # steps in an episode
-    dynamics: AbstractDynamics = Unicycle()
+    dynamics: AbstractDynamics = Unicycle()  # how an agent moves, the same for all
 
     def __check_init__(self):
         if not 0 < self.spread < 1e6:

@@ -26,7 +26,7 @@ class Rendezvous(AbstractGame):
     rest_weight: float = 0.0  # of the squared rates in the cost, so that agents come to rest
     dt: float = 0.1  # s
     horizon: int = 40  # steps in an episode
-    dynamics: AbstractDynamics = Unicycle()
+    dynamics: AbstractDynamics = Unicycle()  # how an agent moves, the same for all
 
     def __check_init__(self):
         if not 0 < self.size < 1e6:

@@ -1,0 +1,106 @@
+"""Ctrl-C ends every verb with one line and exit code 130, whatever it is doing."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from marlyap import cli
+from marlyap.cli import main
+
+
+TINY = """--task.horizon 4 --steps 16 --schedule.environments 2 --schedule.steps_per_update 4
+--schedule.warmup 8 --schedule.capacity 40 --schedule.judge_episodes 2
+--algorithm.actor_width 4 --algorithm.critic_width 4 --algorithm.batch 4""".split()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("interrupts")
+    assert main(["train", "rendezvous", "masac", "--out", str(out), *TINY]) == 0
+    return out / "seed0"
+
+
+def interrupted(argv, seconds):
+    """Exit code and standard error of a command that is sent SIGINT after so many seconds."""
+    command = [sys.executable, "-m", "marlyap", *map(str, argv)]
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as child:
+        time.sleep(seconds)
+        child.send_signal(signal.SIGINT)
+        sent = time.monotonic()
+        _, said = child.communicate()
+    return child.returncode, said, time.monotonic() - sent
+
+
+def verbs(run, out):
+    return {
+        "evaluate": ["evaluate", run, "--episodes", "100000"],
+        "certify": ["certify", run, "--rollouts", "100000", "--out", out / "certificate"],
+        "check-task": ["check-task", "formation"],
+        "report": ["report", run, "--episodes", "100000", "--out", out / "report.html"],
+        "watch": ["watch", run, "--out", out],
+        "list": ["list"],
+        "demo": ["demo", "--out", out / "demo"],
+        "train": ["train", "formation", "masac", "--out", out / "train"],
+    }
+
+
+def ends_in_one_line(argv, seconds):
+    code, said, took = interrupted(argv, seconds)
+    lines = said.strip().splitlines()
+    assert code == 130 and "Traceback" not in said, (code, said)
+    assert len(lines) == 1 and lines[0].startswith("marlyap: interrupted; "), said
+    assert took < 10
+
+
+@pytest.mark.parametrize(
+    ("verb", "seconds"), [("evaluate", 0.3), ("train", 0.6), ("certify", 8.0), ("check-task", 3.0)]
+)
+def test_an_interrupt_is_one_line(run, tmp_path, verb, seconds):
+    """While Python starts, JAX is imported, XLA compiles, and rollouts run."""
+    ends_in_one_line(verbs(run, tmp_path)[verb], seconds)
+    assert not [p for p in tmp_path.rglob("*") if p.is_file()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [0.3, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0])
+@pytest.mark.parametrize("verb", ["evaluate", "certify", "check-task", "report"])
+def test_an_interrupt_at_any_moment_is_one_line(run, tmp_path, verb, seconds):
+    argv = verbs(run, tmp_path)[verb]
+    code, said, took = interrupted(argv, seconds)
+    assert "Traceback" not in said and code in (0, 130) and took < 30, (code, said)
+    assert code == 0 or "marlyap: interrupted" in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", ["watch", "list", "demo", "train"])
+def test_every_verb_ends_in_one_line(run, tmp_path, verb):
+    ends_in_one_line(verbs(run, tmp_path)[verb], 0.5)
+
+
+def test_in_process_an_interrupt_is_a_code(monkeypatch, capfd):
+    def stop(argv):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "command", stop)
+    assert main(["list"]) == 130
+    assert "marlyap: interrupted; " in capfd.readouterr().err
+
+
+def test_an_interrupt_that_python_does_not_come_to_still_ends_it(tmp_path):
+    """A thread is told of the signal while the main one is in one long call of C."""
+    script = "from marlyap import cli; cli.on_interrupt_exit(); print('ready', flush=True); "
+    script += "import hashlib; hashlib.pbkdf2_hmac('sha256', b'a', b'b', 2 * 10**7)"
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as child:
+        assert child.stdout is not None and child.stdout.readline() == "ready\n"
+        time.sleep(0.2)
+        os.kill(child.pid, signal.SIGINT)
+        _, said = child.communicate()
+    assert child.returncode == 130 and "nothing was written" in said
