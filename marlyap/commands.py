@@ -9,7 +9,7 @@ import shutil
 import sys
 import time
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, cast
@@ -27,7 +27,7 @@ from marlyap.certificates import CERTIFICATES
 from marlyap.certificates.safety import has_rules
 from marlyap.certify import certify, save
 from marlyap.conformance import conformance
-from marlyap.controllers import CONTROLLERS
+from marlyap.controllers import CONTROLLERS, load as load_controller, names_a_controller
 from marlyap.errors import UserError, within
 from marlyap.evaluation import RESTS, evaluate
 from marlyap.game import AbstractGame
@@ -36,6 +36,7 @@ from marlyap.recheck import recheck
 from marlyap.report import MARK, Film, Page, html
 from marlyap.run import Run, expand
 from marlyap.seeds import stream
+from marlyap.sensing import Entry
 from marlyap.subject import asked, refuse_all_but_task, subject
 from marlyap.tasks import TASKS
 from marlyap.trainer import SCHEDULES, Trainer, schedule_for
@@ -125,20 +126,6 @@ def assemble(args: Namespace, overrides: Overrides) -> Trainer:
     return Trainer(parts["task"], parts["algorithm"], parts["schedule"])
 
 
-def own_code(
-    args: Namespace, overrides: Overrides
-) -> tuple[AbstractGame | None, AbstractAlgorithm | None]:
-    """Task and algorithm that the user named because the run's are his own code."""
-    game = config.load(args.task, AbstractGame) if args.task else None
-    algorithm = config.load(args.algorithm, AbstractAlgorithm) if args.algorithm else None
-    for path, text in overrides.items():
-        part, _, field = path.partition(".")
-        if part != "task" or game is None:
-            raise UserError(f"--{path}: here only --task.FIELD beside --task can be set.")
-        game = config.override(game, field, text)
-    return game, algorithm
-
-
 def seeds(words: list[str]) -> list[int]:
     """The seeds asked for: whole numbers, each once."""
     each = [w for word in words for w in word.split(",")]
@@ -165,11 +152,11 @@ def measure(args: Namespace, overrides: Overrides) -> Result:
     found: list[groups.Measured] = []
     directories = []
     for word in args.runs:
-        if word in CONTROLLERS:
+        if names_a_controller(word):
             if game is None:
                 raise UserError(f"task: {word} needs --task, the task it is to be measured on.")
-            result = evaluate(game, CONTROLLERS[word](game), args.episodes, starts)
-            found.append(groups.of_controller(word, game, result, starts))
+            result = evaluate(game, load_controller(word, game), args.episodes, starts)
+            found.append(groups.of_controller(word.rpartition(":")[2], game, result, starts))
         elif Path(word).exists():
             directories.append(Path(word))
         else:
@@ -298,6 +285,14 @@ def cells(row: dict[str, Any], ruled: bool) -> list[str]:
     ]
 
 
+def one_run(word: str) -> Path:
+    """The one run at this place. Raises UserError where there is none, or several."""
+    found = expand([Path(word)])
+    if len(found) > 1:
+        raise UserError(f"run: {word} holds {len(found)} runs; name one, such as {found[0]}.")
+    return found[0]
+
+
 SAMPLED = ("reach", "reach-and-stay", "decrease", "contraction", "basin", "quantiles")
 
 
@@ -305,16 +300,26 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
     """`certify`: the verdicts of several certificates on one controller, stored to be rechecked."""
     if not 0 < args.confidence < 1:
         raise UserError(f"confidence: {args.confidence} must lie between 0 and 1.")
-    game, algorithm = own_code(args, overrides)
-    out = args.out
-    if args.run in CONTROLLERS:
-        if game is None or out is None:
-            missing = "--task TASK" if game is None else "--out DIRECTORY"
+    out, rollouts = args.out, args.rollouts
+    if rollouts is not None:
+        within("rollouts", rollouts, 1, 10_000_000)
+    if names_a_controller(args.run):
+        if args.task is None or out is None:
+            missing = "--task TASK" if args.task is None else "--out DIRECTORY"
             raise UserError(f"certify: {args.run} is a controller, not a run; add {missing}.")
-        controller: Any = CONTROLLERS[args.run](game)
+        game = asked(args.task, overrides)
+        controller: Any = load_controller(args.run, game)
     else:
-        run = Run.open(expand([Path(args.run)])[0], game, algorithm)
-        game, controller = run.game, run.controller()
+        place = one_run(args.run)
+        run, game = subject(place, args.task, args.algorithm, overrides)
+        controller = run.controller(game)
+        for note in run.warnings:
+            say(note)
+        if game is not run.game and out is None:
+            raise UserError(
+                f"out: this certificate is not about the task that {place} was trained on; say "
+                "where it goes with --out DIRECTORY."
+            )
         out = out or run.directory / "certificate"
     if out.exists() and not args.force:
         raise UserError(f"out: {out} already exists; choose another or add --force.")
@@ -325,8 +330,8 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
             hint = config.suggest(name, CERTIFICATES)
             raise UserError(f"certificates: there is none called '{name}'; {hint}")
         c = CERTIFICATES[name]
-        several = args.rollouts is not None and "rollouts" in config.fields(c)
-        chosen[name] = dataclasses.replace(c, rollouts=args.rollouts) if several else c  # pyright: ignore
+        several = rollouts is not None and "rollouts" in config.fields(c)
+        chosen[name] = dataclasses.replace(c, rollouts=rollouts) if several else c  # pyright: ignore
     V = cost_sum(game, controller, stream(args.seed, "calibrate"))
     if V.ball > game.radius:
         say(
@@ -447,7 +452,7 @@ def is_report(path: Path) -> bool:
 
 def watch(args: Namespace, overrides: Overrides) -> Result:
     """Film one episode."""
-    run, game = subject(expand([args.run])[0], args.task, args.algorithm, overrides)
+    run, game = subject(one_run(args.run), args.task, args.algorithm, overrides)
     place = args.out or run.directory
     if not place.is_dir():
         raise UserError(f"out: there is no directory {place}.")
@@ -538,9 +543,29 @@ def fields_of(name: str, quiet: bool) -> dict[str, Any]:
     table.add_column("meaning", overflow="fold")
     for row in rows:
         table.add_row(*map(escape, row))
+    found: dict[str, Any] = {
+        option: {"value": value, "meaning": note} for option, value, note in rows
+    }
     if not quiet:
         Console().print(table)
-    return {option: {"value": value, "meaning": note} for option, value, note in rows}
+    if (game := game_called(name)) is not None:
+        entries = game.entries()
+        found["entries"] = {k: [e._asdict() for e in of_kind] for k, of_kind in entries.items()}
+        if not quiet:
+            show_entries(entries)
+    return found
+
+
+def show_entries(entries: Mapping[str, Sequence[Entry]]) -> None:
+    """What every number of an observation, a state and an action is."""
+    for kind, of_kind in entries.items():
+        table = Table(title=f"one agent's {kind}", title_justify="left", title_style="bold")
+        for head in ("#", "entry", "unit", "frame"):
+            table.add_column(head, overflow="fold")
+        for k, entry in enumerate(of_kind):
+            table.add_row(str(k), escape(entry.name), entry.unit, entry.frame)
+        if of_kind:
+            Console().print(table)
 
 
 def rows_of(name: str) -> list[tuple[str, str, str]]:
@@ -558,10 +583,19 @@ def rows_of(name: str) -> list[tuple[str, str, str]]:
     if ":" not in name and not name.endswith(".py"):
         there = [*TASKS, *ALGORITHMS, *CONTROLLERS, *CERTIFICATES, *PRESETS, "schedule"]
         raise UserError(f"name: nothing is called '{name}'; {config.suggest(name, there)}")
-    try:
-        return dotted(config.load(name, AbstractGame), "task")
-    except config.NotOfThatKind:
-        return dotted(config.load(name, AbstractAlgorithm), "algorithm")
+    game = game_called(name)
+    if game is not None:
+        return dotted(game, "task")
+    return dotted(config.load(name, AbstractAlgorithm), "algorithm")
+
+
+def game_called(name: str) -> AbstractGame | None:
+    """The task of this name, or in path/to/file.py:Name; None where that is no task."""
+    if name in TASKS or ":" not in name:
+        return TASKS.get(name)
+    with suppress(config.NotOfThatKind):
+        return config.load(name, AbstractGame)
+    return None
 
 
 def demo(args: Namespace, overrides: Overrides) -> Result:

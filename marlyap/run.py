@@ -78,6 +78,10 @@ class Run:
             "seed": seed,
             "names": names,
             "code": code,
+            "entries": {
+                kind: [entry._asdict() for entry in found]
+                for kind, found in trainer.game.entries().items()
+            },
             "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             "versions": store.versions(),
         }

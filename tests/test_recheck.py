@@ -556,10 +556,16 @@ def test_what_a_linearisation_does_not_show_cannot_be_claimed(
     if turns:
         table["contraction"] = Contraction(rollouts=100, calibration=100, T=9, share=0.1)
         table["safe"] = Safe(rollouts=100, share=0.1)
+    else:
+        V, table["decrease"] = None, Decrease(rollouts=100, share=0.1)
     result = certify(game, controller, table, seed=1, confidence=0.9, V=V)
     save(tmp_path / "c", result, game, controller, V)
     found = recheck(tmp_path / "c")
-    assert found["agrees"] and not found["holds"] and {*result["left_out"]} <= {"safe"}
+    assert (
+        found["agrees"]
+        and not found["holds"]
+        and [*result["left_out"]] == ["safe" if turns else "decrease"]
+    )
     claim = result["verdicts"]["linearisation"]["claim"]
     assert ("NO: " if turns else "no equilibrium") in claim
     said = "verdicts/linearisation/"
@@ -571,6 +577,10 @@ def test_what_a_linearisation_does_not_show_cannot_be_claimed(
             put((said + "figures/uncontrollable_eigenvalues", [0.5])),
             put((said + "figures/action_at_goal", 0.0)),
             lambda meta, arrays: meta["left_out"].update(apart="a team of one"),
+            lambda meta, arrays: meta["left_out"].update(contraction="V, as before, is 3"),
+            put(
+                ("left_out/" + ("safe" if turns else "decrease"), lambda old: old + " It is safe.")
+            ),
         )
     ):
         with pytest.raises(Rejected):

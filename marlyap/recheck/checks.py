@@ -344,7 +344,7 @@ def apart(case: Case) -> dict[str, Any]:
     steps, d = sim.game["horizon"] + c["stay"], said["gap"]
     if len(sim.slots) < 2:
         raise Rejected("certificate: apart is about several agents, and the game has one.")
-    seen, gap = sim.roll(c["rollouts"], steps), np.inf
+    seen, gap = sim.roll(c["rollouts"], steps), np.full(c["rollouts"], np.inf)
     for i in range(1, len(sim.slots)):
         way = seen["x"][..., i:, :2] - seen["x"][..., : len(sim.slots) - i, :2]
         gap = np.minimum(gap, np.linalg.norm(way, axis=-1).min(axis=(1, 2)))
@@ -356,7 +356,7 @@ def apart(case: Case) -> dict[str, Any]:
 
 def robustness(case: Case) -> dict[str, Any]:
     sim, v, c, H = case.sim, case.v, case.c, case.sim.game["horizon"]
-    curve, said, out, weakest = case.figures["curve"], swept(sim, c), {}, None
+    curve, said, out = case.figures["curve"], swept(sim, c), {}
     told = [(point["perturbation"], point["change"]) for point in curve]
     agree("what robustness sweeps", [*said.items()], told)
     tail, radius, n = case.tail / len(curve), sim.game["radius"], c["rollouts"]
@@ -375,12 +375,11 @@ def robustness(case: Case) -> dict[str, Any]:
         agree(f"whether {name} holds", point["bound"] >= c["share"], point["holds"])
         worst(case, found, point["worst"], change)
         out[name] = {"trials": n, "successes": k, "bound": point["bound"], "border": border}
-        weakest = point if weakest is None or k < weakest["successes"] else weakest
     for key, total in (("trials", sum), ("successes", sum), ("bound", min), ("holds", all)):
         agree(f"{key} of robustness", total(p[key] for p in curve), v[key])
-    agree(
-        "the worst case of robustness", weakest["worst"] | {"change": weakest["change"]}, v["worst"]
-    )
+    weakest = min(curve, key=lambda point: point["successes"])
+    least = weakest["worst"] | {"change": weakest["change"]}
+    agree("the worst case of robustness", least, v["worst"])
     near("the confidence of each point", 1 - tail, case.figures["confidence_each"], 1e-12)
     own = {"share_asked": c["share"], "curve": curve, "without": {}}
     own["confidence_each"] = case.figures["confidence_each"]

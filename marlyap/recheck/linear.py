@@ -75,7 +75,7 @@ def look(sim: World, x: np.ndarray, goal: np.ndarray) -> Look:
     act = lambda x: sim.act(x, np.broadcast_to(goal, (len(x), *goal.shape)), sim.linked)
     flat = lambda x: sim.step(x, sim.limits * act(x)).reshape(len(x), -1)
     put = lambda rows: (x.ravel() + rows).reshape(-1, *x.shape)
-    J = flat(put(1j * TINY * np.eye(x.size))).imag.T / TINY
+    J = np.imag(flat(put(1j * TINY * np.eye(x.size)))).T / TINY
     here = flat(x[None])
     ways = np.concatenate([np.eye(x.size), np.random.default_rng(0).normal(size=(8, x.size))])
     gap = 0.0
@@ -97,7 +97,7 @@ def fixed(sim: World, agents: np.ndarray, decay: float) -> tuple[int, list[float
     """
     x, n, m = agents[:1], agents.shape[1], len(sim.limits)
     step = lambda x, a: sim.step(x[:, None], sim.limits * a[:, None])[:, 0]
-    slope = lambda y: y.imag.T / TINY
+    slope = lambda y: np.imag(y).T / TINY
     states, none = x + 1j * TINY * np.eye(n), np.zeros((n, m))
     A, B = slope(step(states, none)), slope(step(x + np.zeros((m, n)) + 0j, 1j * TINY * np.eye(m)))
     goal = np.broadcast_to(x[0, :2], (n, 1, 2))
