@@ -274,3 +274,35 @@ def test_check_task_ends_with_a_summary(tmp_path, capsys):
     out = capsys.readouterr().out
     assert out.count("skipped") == 2 and "laws need sound shapes" in out
     assert out.strip().splitlines()[-1].endswith("; broken: shapes.")
+
+
+def test_train_ignores_no_task(run, capsys):
+    said = sentence(capsys, *TRAIN, "--task", "formation", "--out", "out")
+    assert "--task: it is for --resume" in said
+    said = sentence(capsys, "train", "--resume", run, "--task", "formation")
+    assert "was trained with rendezvous" in said
+    said = sentence(capsys, "train", "--resume", run, "--algorithm", "maddpg")
+    assert "was trained with masac" in said
+    assert main(["train", "rendezvous", "masac", "--resume", str(run)]) == 0
+
+
+def test_help_has_examples_that_can_be_parsed():
+    """Every example is a command that the parser takes and whose names are there."""
+    import shlex
+
+    from marlyap.algorithms import ALGORITHMS
+    from marlyap.cli import EXAMPLES, parse, parser
+    from marlyap.controllers import CONTROLLERS
+    from marlyap.tasks import TASKS
+
+    known = {*TASKS, *ALGORITHMS, *CONTROLLERS}
+    verbs = next(a for a in parser()._actions if a.dest == "verb").choices
+    assert set(EXAMPLES) == set(verbs or ())
+    for verb, text in EXAMPLES.items():
+        for line in text.strip().splitlines():
+            words = shlex.split(line)
+            args, _ = parse(words[1:])
+            assert words[0] == "marlyap" and args.verb == verb
+            asked = [getattr(args, "task", None), getattr(args, "algorithm", None)]
+            asked += [r for r in getattr(args, "runs", ()) if "/" not in str(r)]
+            assert all(name is None or name in known or ":" in name for name in asked), line
