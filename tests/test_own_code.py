@@ -145,22 +145,6 @@ def test_a_finished_run_without_a_sound_checkpoint_is_not_done(run, capsys):
     assert "no checkpoint to load" in sentence(capsys, "train", "--resume", run)
 
 
-@pytest.mark.parametrize(
-    ("spoil", "says"),
-    [
-        (lambda text: "", "ends at iteration 0 of 2"),
-        (lambda text: text[: text.index("\n") + 9], "ends at iteration 1 of 2"),
-        (lambda text: "\x00{" + text, "is not sound JSON"),
-    ],
-)
-def test_a_damaged_log_warns(run, spoil, says):
-    log = run / "log.jsonl"
-    assert Run.open(run).warnings == ()
-    log.write_text(spoil(log.read_text()))
-    (warning,) = Run.open(run).warnings
-    assert warning.startswith("log: ") and says in warning
-
-
 def test_the_log_names_faults_only_where_there_are_any(run):
     assert not [key for line in Run.open(run).history() for key in line if key.startswith("bad_")]
 
