@@ -20,7 +20,7 @@ def main(directory: Path, out: Path) -> dict:
     draw.trajectories_png(page["films"], out / "starts.png")
     draw.film_gif(film.one(run, 0, seed=0), out / "film.gif")
     print(f"Drawn: {out}/report.html, starts.png, film.gif")
-    return page["summary"]
+    return page["groups"][0]
 
 
 if __name__ == "__main__":

@@ -440,13 +440,13 @@ def check_task(args: Namespace, overrides: Overrides) -> Result:
 def report(args: Namespace, overrides: Overrides) -> Result:
     """Write the HTML page and the pictures."""
     opened = [subject(d, args.task, args.algorithm, overrides) for d in expand(args.runs)]
-    runs = [run for run, _ in opened]
+    runs, games = [run for run, _ in opened], [game for _, game in opened]
     default = runs[0].directory / "report.html" if len(runs) == 1 else Path("report.html")
     out = args.out or default
     if out.exists() and not is_report(out):
         raise UserError(f"out: {out} exists and is not a report of marlyap; choose another file.")
     command = shlex.join(["marlyap", *sys.argv[1:]])
-    page = film.page(opened, args.episodes, starts_of(args.seed), command, args.task or "")
+    page = film.page(runs, args.episodes, starts_of(args.seed), command, games, args.task or "")
     store.write_text_atomic(out, html(cast(Page, page)))
     from marlyap import draw
 

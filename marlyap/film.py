@@ -35,19 +35,20 @@ MOST_COMPARED = 12
 
 
 def page(
-    opened: Sequence[tuple[Run, AbstractGame]],
+    runs: Sequence[Run],
     episodes: int,
     seed: int,
     command: str = "",
+    games: Sequence[AbstractGame] | None = None,
     called: str = "",
 ) -> dict[str, Any]:
-    """Everything that `report.html` draws of these runs, each measured on the game beside it.
+    """Everything that `report.html` draws of these runs.
 
-    `called` is the name of that game where it is not the one that a run was trained on.
+    `games` has the game that each is measured on, by default its own, and `called` is the name of
+    that game where it is not the one that a run was trained on.
     """
-    runs = [run for run, _ in opened]
     found = []
-    for run, game in opened:
+    for run, game in zip(runs, games or [run.game for run in runs], strict=True):
         result = evaluate(game, run.controller(game), episodes, seed)
         found.append(groups.of_run(run, result, seed, game, called))
     names, labels = groups.labels(found, brief=True)

@@ -586,12 +586,8 @@ def test_watch_prints_one_object(run, capsys):
 def test_list_prints_one_object(capsys):
     code, out, _ = call(capsys, "list", "--json")
     found = strict(out)
-    assert code == 0 and found.keys() >= {
-        "tasks",
-        "algorithms",
-        "controllers",
-        "certificates",
-        "presets",
+    assert code == 0 and found.keys() == {
+        *("tasks", "algorithms", "controllers", "certificates", "presets")
     }
     assert all(len(text) > 10 and "\n" not in text for f in found.values() for text in f.values())
     code, out, _ = call(capsys, "list")
