@@ -56,7 +56,7 @@ def sentence(capsys, *argv):
 def test_a_broken_task_is_refused_before_a_run_is_made(method, parts, tmp_path, capsys):
     (tmp_path / "t.py").write_text(f"{HEAD}    def {method}\n")
     said = sentence(capsys, "train", "t.py:T", "masac", "--out", "out", *TINY)
-    assert said.startswith("marlyap: task: ") and "t.py, line 5" in said
+    assert said.startswith("marlyap: task: ") and "t.py:5" in said
     assert all(part in said for part in parts), said
     assert not (tmp_path / "out").exists()
 
@@ -72,9 +72,9 @@ def test_negative_costs_stop_the_training_and_leave_no_directory(tmp_path, capsy
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ("x = 1\ny = undefined", "t.py, line 2: NameError (name 'undefined' is not defined)"),
-        ("x = 1\ny = (", "t.py, line 2: SyntaxError"),
-        ("import nothing_of_that_name", "t.py, line 1: ModuleNotFoundError"),
+        ("x = 1\ny = undefined", "t.py:2: NameError (name 'undefined' is not defined)"),
+        ("x = 1\ny = (", "t.py:2: SyntaxError"),
+        ("import nothing_of_that_name", "t.py:1: ModuleNotFoundError"),
         (
             "from marlyap.tasks import Rendezvous as R\nclass T(R):\n  size = 3.0",
             "size: float = 3.0",
@@ -101,7 +101,7 @@ def test_only_errors_of_the_users_code_lose_their_traceback(tmp_path):
         namespace["f"]()
     except KeyError as error:
         caught = error
-    assert caught and explained(caught) == "t.py, line 2: KeyError ('x')."
+    assert caught and explained(caught) == "t.py:2: KeyError ('x')."
     try:
         json.loads("{")
     except ValueError as error:
