@@ -49,11 +49,11 @@ EXAMPLES = {
     "evaluate": """
   marlyap evaluate runs/demo
   marlyap evaluate runs/demo/seed0 --task rendezvous-late
-  marlyap evaluate runs/demo/seed0 pursuit --task rendezvous --task.size 2""",
+  marlyap evaluate runs/demo/seed0 tree-pursuit --task rendezvous --task.size 2""",
     "certify": """
   marlyap certify runs/demo/seed0
   marlyap certify runs/demo/seed0 --certificates reach --task.size 2 --out certificate
-  marlyap certify pursuit --task rendezvous --out certificate""",
+  marlyap certify tree-pursuit --task rendezvous --out certificate""",
     "recheck": """
   marlyap recheck runs/demo/seed0/certificate""",
     "check-task": """

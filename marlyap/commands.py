@@ -37,7 +37,7 @@ from marlyap.report import MARK, Film, Page, html
 from marlyap.run import Run, expand
 from marlyap.seeds import stream
 from marlyap.sensing import Entry
-from marlyap.subject import asked, refuse_all_but_task, subject
+from marlyap.subject import asked, refuse_all_but_task, subject, supplies
 from marlyap.tasks import TASKS
 from marlyap.trainer import SCHEDULES, Trainer, schedule_for
 from marlyap.workers import train_all
@@ -62,10 +62,14 @@ def train(args: Namespace, overrides: Overrides) -> Result:
         rule = config.load(args.algorithm, AbstractAlgorithm) if args.algorithm else None
         runs = [Run.open(d, game, rule) for d in expand(args.resume)]
         for run in runs:
+            keeps(run, args, game, rule)
             for warning in run.warnings:
                 say(f"warning: {warning}")
         readable(runs)
     else:
+        if args.own_task or args.own_algorithm:
+            option = "--task" if args.own_task else "--algorithm"
+            raise UserError(f"{option}: it is for --resume; a new run is train TASK ALGORITHM.")
         if not args.task or not args.algorithm:
             raise UserError("train: name a task and an algorithm, as in train rendezvous masac.")
         runs = create(args, overrides)
@@ -89,6 +93,23 @@ def trained(runs: list[Run], args: Namespace, new: bool) -> int:
                 with suppress(OSError):  # as when other runs are in it
                     run.directory.parent.rmdir()
         raise
+
+
+def keeps(
+    run: Run, args: Namespace, game: AbstractGame | None, rule: AbstractAlgorithm | None
+) -> None:
+    """Raise UserError if another task or algorithm is named than the run was trained with."""
+    own_rule = rule is not None and bool(config.own_classes(run.trainer.algorithm))
+    fits = {
+        "task": game is None or supplies(args.task, game, run),
+        "algorithm": rule is None or own_rule,
+    }
+    for part, is_own in fits.items():
+        if not is_own and getattr(args, part) != run.names[part]:
+            raise UserError(
+                f"{part}: {run.directory} was trained with {run.labels[part]}, and a run that is "
+                "resumed keeps it; leave the other out."
+            )
 
 
 def readable(runs: list[Run]) -> None:

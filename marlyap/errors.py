@@ -76,24 +76,24 @@ def explained(error: BaseException) -> str | None:
 
 
 def raised_at(error: BaseException) -> str | None:
-    """'file.py, line 12': the last line of the user's code that the error came through."""
+    """'file.py:12': the last line of the user's code that the error came through."""
     found = None
     if isinstance(error, SyntaxError) and error.filename and error.lineno:
-        found = f"{Path(error.filename).name}, line {error.lineno}"
+        found = f"{Path(error.filename).name}:{error.lineno}"
     step = error.__traceback__
     while step is not None:
         if _is_users(step.tb_frame):
-            found = f"{Path(step.tb_frame.f_code.co_filename).name}, line {step.tb_lineno}"
+            found = f"{Path(step.tb_frame.f_code.co_filename).name}:{step.tb_lineno}"
         step = step.tb_next
     return found
 
 
 def defined_at(obj: Any, method: str) -> str | None:
-    """'file.py, line 12': where the user's class defines a method; None where it does not."""
+    """'file.py:12': where the user's class defines a method; None where it does not."""
     code = getattr(inspect.unwrap(getattr(type(obj), method, None) or len), "__code__", None)
     if code is None or not _is_users_file(code.co_filename):
         return None
-    return f"{Path(code.co_filename).name}, line {code.co_firstlineno}"
+    return f"{Path(code.co_filename).name}:{code.co_firstlineno}"
 
 
 def first_line(error: BaseException) -> str:

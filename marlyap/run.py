@@ -9,9 +9,9 @@ policy/         the best policy so far, and the Lyapunov function: what is evalu
 import json
 import shutil
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -170,8 +170,7 @@ class Run:
         for part, family in zip(parts, (AbstractGame, AbstractAlgorithm, Schedule), strict=True):
             if not isinstance(part, family):
                 raise UserError(f"run: {where} has a {type(part).__name__} in the wrong place.")
-        run = cls(directory, Trainer(*parts), about["seed"], names, tuple(warnings))
-        return replace(run, warnings=(*warnings, *run._log_faults()))
+        return cls(directory, Trainer(*parts), about["seed"], names, tuple(warnings))
 
     @property
     def untouched(self) -> bool:
@@ -264,20 +263,6 @@ class Run:
         path = self.directory / "log.jsonl"
         lines = store.read_jsonl(path) if path.is_file() else []
         return [line for line in lines if isinstance(line, dict)]
-
-    def _log_faults(self) -> Iterator[str]:
-        """What is missing from the log of the iterations that the newest checkpoint has done."""
-        done = max(self.checkpoints.steps(), default=0)
-        try:
-            last = max((line.get("iteration", 0) for line in self.history()), default=0)
-        except (UserError, TypeError) as error:
-            yield f"log: {error} The learning curves will be missing."
-            return
-        if last < done:
-            yield (
-                f"log: {self.directory / 'log.jsonl'} ends at iteration {last} of {done}; the "
-                "learning curves will be cut short."
-            )
 
     def rewind(self, iteration: int) -> None:
         """Forget what the log says of iterations that will be done again."""

@@ -37,7 +37,7 @@ def subject(
             "marlyap; leave --algorithm out."
         )
     game = run.game
-    if task and given is not None and not _supplies(task, given, run):
+    if task and given is not None and not supplies(task, given, run):
         game = given
     game = changed(game, overrides)
     same = type(game) is type(run.game) and config.record(game) == config.record(run.game)
@@ -62,7 +62,7 @@ def refuse_all_but_task(overrides: Mapping[str, str]) -> None:
             raise UserError(f"--{path}: only a training sets it; here --task.FIELD can be set.")
 
 
-def _supplies(task: str, given: AbstractGame, run: Run) -> bool:
+def supplies(task: str, given: AbstractGame, run: Run) -> bool:
     """Whether the named task is the code of the run's own game."""
     name = task.rpartition(":")[2]
     own = type(given) is type(run.game) and bool(config.own_classes(given))

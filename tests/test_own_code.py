@@ -56,7 +56,7 @@ def sentence(capsys, *argv):
 def test_a_broken_task_is_refused_before_a_run_is_made(method, parts, tmp_path, capsys):
     (tmp_path / "t.py").write_text(f"{HEAD}    def {method}\n")
     said = sentence(capsys, "train", "t.py:T", "masac", "--out", "out", *TINY)
-    assert said.startswith("marlyap: task: ") and "t.py, line 5" in said
+    assert said.startswith("marlyap: task: ") and "t.py:5" in said
     assert all(part in said for part in parts), said
     assert not (tmp_path / "out").exists()
 
@@ -72,9 +72,9 @@ def test_negative_costs_stop_the_training_and_leave_no_directory(tmp_path, capsy
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ("x = 1\ny = undefined", "t.py, line 2: NameError (name 'undefined' is not defined)"),
-        ("x = 1\ny = (", "t.py, line 2: SyntaxError"),
-        ("import nothing_of_that_name", "t.py, line 1: ModuleNotFoundError"),
+        ("x = 1\ny = undefined", "t.py:2: NameError (name 'undefined' is not defined)"),
+        ("x = 1\ny = (", "t.py:2: SyntaxError"),
+        ("import nothing_of_that_name", "t.py:1: ModuleNotFoundError"),
         (
             "from marlyap.tasks import Rendezvous as R\nclass T(R):\n  size = 3.0",
             "size: float = 3.0",
@@ -101,7 +101,7 @@ def test_only_errors_of_the_users_code_lose_their_traceback(tmp_path):
         namespace["f"]()
     except KeyError as error:
         caught = error
-    assert caught and explained(caught) == "t.py, line 2: KeyError ('x')."
+    assert caught and explained(caught) == "t.py:2: KeyError ('x')."
     try:
         json.loads("{")
     except ValueError as error:
@@ -143,22 +143,6 @@ def test_a_finished_run_without_a_sound_checkpoint_is_not_done(run, capsys):
     for arrays in run.glob("checkpoints/*/arrays.safetensors"):
         arrays.write_bytes(arrays.read_bytes()[:100])
     assert "no checkpoint to load" in sentence(capsys, "train", "--resume", run)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "says"),
-    [
-        (lambda text: "", "ends at iteration 0 of 2"),
-        (lambda text: text[: text.index("\n") + 9], "ends at iteration 1 of 2"),
-        (lambda text: "\x00{" + text, "is not sound JSON"),
-    ],
-)
-def test_a_damaged_log_warns(run, spoil, says):
-    log = run / "log.jsonl"
-    assert Run.open(run).warnings == ()
-    log.write_text(spoil(log.read_text()))
-    (warning,) = Run.open(run).warnings
-    assert warning.startswith("log: ") and says in warning
 
 
 def test_the_log_names_faults_only_where_there_are_any(run):
@@ -274,3 +258,35 @@ def test_check_task_ends_with_a_summary(tmp_path, capsys):
     out = capsys.readouterr().out
     assert out.count("skipped") == 2 and "laws need sound shapes" in out
     assert out.strip().splitlines()[-1].endswith("; broken: shapes.")
+
+
+def test_train_ignores_no_task(run, capsys):
+    said = sentence(capsys, *TRAIN, "--task", "formation", "--out", "out")
+    assert "--task: it is for --resume" in said
+    said = sentence(capsys, "train", "--resume", run, "--task", "formation")
+    assert "was trained with rendezvous" in said
+    said = sentence(capsys, "train", "--resume", run, "--algorithm", "maddpg")
+    assert "was trained with masac" in said
+    assert main(["train", "rendezvous", "masac", "--resume", str(run)]) == 0
+
+
+def test_help_has_examples_that_can_be_parsed():
+    """Every example is a command that the parser takes and whose names are there."""
+    import shlex
+
+    from marlyap.algorithms import ALGORITHMS
+    from marlyap.cli import EXAMPLES, parse, parser
+    from marlyap.controllers import CONTROLLERS
+    from marlyap.tasks import TASKS
+
+    known = {*TASKS, *ALGORITHMS, *CONTROLLERS}
+    verbs = next(a for a in parser()._actions if a.dest == "verb").choices
+    assert set(EXAMPLES) == set(verbs or ())
+    for verb, text in EXAMPLES.items():
+        for line in text.strip().splitlines():
+            words = shlex.split(line)
+            args, _ = parse(words[1:])
+            assert words[0] == "marlyap" and args.verb == verb
+            asked = [getattr(args, "task", None), getattr(args, "algorithm", None)]
+            asked += [r for r in getattr(args, "runs", ()) if "/" not in str(r)]
+            assert all(name is None or name in known or ":" in name for name in asked), line

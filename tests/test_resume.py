@@ -659,7 +659,7 @@ def test_what_is_stopped_says_how_to_go_on(number, tmp_path, capsys, monkeypatch
     monkeypatch.setattr(Run, "log", interrupted)
     assert main(["train", "--resume", str(run.directory), "--json"]) == 128 + number
     said = capsys.readouterr()
-    assert f"Go on with: marlyap train --resume {run.directory}" in said.err
+    assert f"Resume with: marlyap train --resume {run.directory}" in said.err
     assert "Stopping at the next checkpoint; once more to stop at once." in said.err
     state = {"run": str(run.directory), "seed": 5, "steps": 16, "finished": False}
     assert json.loads(said.out) == {"runs": [state]}
