@@ -20,7 +20,8 @@ Position = Float[Array, "2"]
 class AbstractDynamics(eqx.Module):
     """A planar agent driven by inputs u in [-limits, limits].
 
-    `blocks` orders the state for semi-implicit Euler: velocities before what they move.
+    `blocks` orders the state for semi-implicit Euler: velocities before what they move. `units`
+    are those of `names`, `input_units` those of `inputs`, and `felt` names the entries of `rates`.
     """
 
     limits: eqx.AbstractVar[tuple[float, ...]]
@@ -28,6 +29,9 @@ class AbstractDynamics(eqx.Module):
     names: eqx.AbstractClassVar[tuple[str, ...]]
     inputs: eqx.AbstractClassVar[tuple[str, ...]]
     blocks: eqx.AbstractClassVar[tuple[tuple[int, ...], ...]]
+    units: ClassVar[tuple[str, ...]] = ()
+    input_units: ClassVar[tuple[str, ...]] = ()
+    felt: ClassVar[tuple[str, ...]] = ()
 
     def __check_init__(self):
         if len(self.limits) != len(self.inputs) or not all(0 < u < 1e6 for u in self.limits):
@@ -125,6 +129,9 @@ class Unicycle(AbstractDynamics):
     integrator: Literal["euler", "rk4"] = "euler"
     names: ClassVar[tuple[str, ...]] = ("x", "y", "psi", "v", "omega")
     inputs: ClassVar[tuple[str, ...]] = ("a", "r")
+    units: ClassVar[tuple[str, ...]] = ("m", "m", "rad", "m/s", "rad/s")
+    input_units: ClassVar[tuple[str, ...]] = ("m/s^2", "rad/s^2")
+    felt: ClassVar[tuple[str, ...]] = ("v", "omega")
     blocks: ClassVar[tuple[tuple[int, ...], ...]] = ((3, 4), (2,), (0, 1))
 
     def field(self, x, u):
@@ -157,6 +164,8 @@ class LateUnicycle(Unicycle):
     """
 
     names: ClassVar[tuple[str, ...]] = (*Unicycle.names, "a", "r")
+    units: ClassVar[tuple[str, ...]] = (*Unicycle.units, *Unicycle.input_units)
+    felt: ClassVar[tuple[str, ...]] = ("v", "omega", "a", "r")
 
     def field(self, x, u):
         return jnp.concatenate([super().field(x[:5], x[5:]), jnp.zeros(2)])
@@ -175,6 +184,9 @@ class DoubleIntegrator(AbstractDynamics):
     integrator: Literal["euler", "rk4"] = "euler"
     names: ClassVar[tuple[str, ...]] = ("x", "y", "vx", "vy")
     inputs: ClassVar[tuple[str, ...]] = ("ax", "ay")
+    units: ClassVar[tuple[str, ...]] = ("m", "m", "m/s", "m/s")
+    input_units: ClassVar[tuple[str, ...]] = ("m/s^2", "m/s^2")
+    felt: ClassVar[tuple[str, ...]] = ("vx", "vy")
     blocks: ClassVar[tuple[tuple[int, ...], ...]] = ((2, 3), (0, 1))
 
     def field(self, x, u):
@@ -200,6 +212,8 @@ class SingleIntegrator(AbstractDynamics):
     integrator: Literal["euler", "rk4"] = "euler"
     names: ClassVar[tuple[str, ...]] = ("x", "y")
     inputs: ClassVar[tuple[str, ...]] = ("vx", "vy")
+    units: ClassVar[tuple[str, ...]] = ("m", "m")
+    input_units: ClassVar[tuple[str, ...]] = ("m/s", "m/s")
     blocks: ClassVar[tuple[tuple[int, ...], ...]] = ((0, 1),)
 
     def field(self, x, u):

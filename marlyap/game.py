@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from marlyap import graph as graphs
 from marlyap.dynamics import AbstractDynamics
 from marlyap.errors import UserError
-from marlyap.sensing import body_frame, goal_errors, near
+from marlyap.sensing import Entry, body_frame, body_frame_entries, goal_errors, near
 from marlyap.types import Action, Features, Key, Links, Obs, Scalar, State
 
 
@@ -146,6 +146,32 @@ class AbstractGame(eqx.Module):
         """The usual o_i: everything near agent i in its own frame (`sensing.body_frame`)."""
         slots, leads = jnp.asarray(self.slots), jnp.asarray(self.leads)
         return body_frame(self.dynamics, state, slots, links, leads, self.radius, headings)
+
+    def local_entries(self, headings: bool = False) -> tuple[Entry, ...]:
+        """What the entries of `local_view` are: for `observation_entries`."""
+        return body_frame_entries(self.dynamics, self.slots.shape[1], headings)
+
+    def observation_entries(self) -> tuple[Entry, ...]:
+        """Name, unit and frame of every entry of an observation; empty where the task tells none.
+
+        Neighbours come in ascending order of their number; an agent with fewer has empty places.
+        """
+        return ()
+
+    def entries(self) -> dict[str, tuple[Entry, ...]]:
+        """Name, unit and frame of every entry of an observation, a state and an action.
+
+        An action is in [-1, 1]; multiplied by the limit it has the unit that is told.
+        """
+        d = self.dynamics
+        units = d.units or ("?",) * len(d.names)
+        input_units = d.input_units or ("?",) * len(d.inputs)
+        x = (Entry(name, unit, "world") for name, unit in zip(d.names, units, strict=True))
+        u = (
+            Entry(f"{name} / {limit:g}", unit, "own")
+            for name, limit, unit in zip(d.inputs, d.limits, input_units, strict=True)
+        )
+        return {"observation": self.observation_entries(), "state": tuple(x), "action": tuple(u)}
 
     @property
     def adjacency(self) -> Bool[np.ndarray, "agent agent"]:

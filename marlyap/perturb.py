@@ -122,6 +122,9 @@ class Perturbed(AbstractGame):
     def observe(self, state, links):
         return self.inner.observe(self.inside(state), links)
 
+    def observation_entries(self):
+        return self.inner.observation_entries()
+
     def step(self, state, action):
         queue = jnp.concatenate([state.memory["queue"], action[None]])
         now, key = queue[0], jax.random.fold_in(self._key(state, 2), state.t)

@@ -4,12 +4,22 @@ A turn or a shift of the whole scene changes nothing (SE(2) invariance), and not
 agent itself and its neighbours enters (locality).
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from marlyap.dynamics import AbstractDynamics
 from marlyap.types import Obs, State
+
+
+class Entry(NamedTuple):
+    """One number of an observation, a state or an action: enough to build it elsewhere."""
+
+    name: str
+    unit: str  # 1 where it has none
+    frame: str  # own: the agent's own axes; world; or nothing, where no axis is meant
 
 
 def into_frame(h: Float[Array, "2"], v: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
@@ -61,6 +71,28 @@ def body_frame(
         return jnp.concatenate([*own, others.ravel()])
 
     return jax.vmap(of)(jnp.arange(slots.shape[0]), slots, leads)
+
+
+def body_frame_entries(dynamics: AbstractDynamics, slots: int, headings: bool) -> tuple[Entry, ...]:
+    """What the entries of one row of `body_frame` are, in their order."""
+    units = dict(zip(dynamics.names, dynamics.units, strict=False))
+
+    def pair(what: str, unit: str) -> list[Entry]:
+        return [Entry(f"{what}, ahead", unit, "own"), Entry(f"{what}, left", unit, "own")]
+
+    own = [Entry(name, units.get(name, "1"), "own") for name in dynamics.felt]
+    own.append(Entry("1 if the goal is told, else 0", "1", ""))
+    own += pair("goal - position, 0 if not told", "m")
+    own += pair("e / (|e| + radius) of e = goal - position", "1")
+    others = []
+    for k in range(slots):
+        who = f"neighbour {k}"
+        others.append(Entry(f"1 if {who} is seen, else all of it is 0", "1", ""))
+        others += pair(f"position of {who} - own position", "m")
+        others += pair(f"e / (|e| + radius) of e = position of {who} - own position", "1")
+        others += pair(f"velocity of {who} over the ground", "m/s")
+        others += pair(f"heading of {who}", "1") if headings else []
+    return (*own, *others)
 
 
 def goal_errors(dynamics: AbstractDynamics, state: State) -> Float[Array, "agent error"]:

@@ -10,6 +10,6 @@ TASKS = {
     "rendezvous-path5": Rendezvous(agents=5, graph="path"),
     "rendezvous-hard": Rendezvous(agents=5, graph="path", dynamics=Unicycle(limits=(2.0, 2.0))),
     "rendezvous-late": Rendezvous(dynamics=LateUnicycle()),
-    "rendezvous-rest": Rendezvous(rest_weight=0.1),
+    "rendezvous-rest": Rendezvous(rest_weight=0.03, horizon=60),
     "formation": Formation(),
 }

@@ -39,6 +39,9 @@ class Rendezvous(AbstractGame):
     def observe(self, state, links):
         return self.local_view(state, links, self.headings)
 
+    def observation_entries(self):
+        return self.local_entries(self.headings)
+
     def costs(self, state, action):
         return with_motion(self, self.distance(state), state, self.rest_weight)
 
