@@ -328,10 +328,14 @@ def of_share(
     )
 
 
+def plain_game(game: AbstractGame) -> AbstractGame:
+    """The game inside all perturbations."""
+    return plain_game(game.inner) if isinstance(game, Perturbed) else game
+
+
 def arrival(game: AbstractGame) -> str:
     """`game.success` in words, also where a task has a definition of its own."""
-    while isinstance(game, Perturbed):
-        game = game.inner
+    game = plain_game(game)
     if type(game).success is AbstractGame.success:
         return arrived(game.radius)
     return f"success as {type(game).__name__}.success defines it"

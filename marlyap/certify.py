@@ -1,7 +1,7 @@
 """Every certificate of one controller, together: shared confidence, one file, fixed beforehand."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +9,16 @@ import numpy as np
 
 from marlyap import store
 from marlyap.certificate import AbstractCertificate, Verdict
+from marlyap.certificates.information import information
 from marlyap.errors import UserError
+from marlyap.evaluation import drives
 from marlyap.game import AbstractGame
 from marlyap.identity import named_arrays, plain, policy_hash, without_arrays, words
 from marlyap.lyapunov_function import AbstractLyapunov, CostSum, cost_sum, require_zero
 from marlyap.rollout import Controller
 from marlyap.seeds import stream
 from marlyap.statistics import bonferroni
+from marlyap.types import Key
 
 
 KIND = "certificate"
@@ -31,17 +34,24 @@ def certify(
     V: AbstractLyapunov | None = None,
     checkpoints: int = 1,
     policy: str | None = None,
+    optional: Collection[str] = (),
+    begin: Callable[[str], None] = lambda name: None,
     tell: Callable[[Verdict], None] = lambda verdict: None,
 ) -> dict[str, Any]:
     """The verdicts of all `certificates`, true together with `confidence`; `holds` if all hold.
 
+    A certificate that is not about such a game, controller or V is left out, and `left_out` says
+    why: those that need V, for one, where V is not 0 on the target set. `holds` is then false,
+    unless the certificate was `optional`. `information` says what the agents act on, and is part of
+    every verdict's scope.
+
     Each sampled one is asked at 1 - (1 - confidence) / (claims * checkpoints) (Bonferroni), with
     `checkpoints` the number of controllers among which this one was or will be chosen by
     certificates. V is by default `cost_sum`. `policy` is the hash that the controller was declared
-    with, and `tell` hears of each verdict at once.
+    with. `begin` hears of each certificate before it is checked, `tell` of each verdict at once.
 
-    Raises UserError if V is asked about and not 0 on the target set, if there are too few rollouts
-    for the confidence asked for, or if the controller is not the one declared.
+    Raises UserError if no certificate is left, if there are too few rollouts for the confidence
+    asked for, or if the controller is not the one declared, or not one for this game.
     """
     if not certificates:
         raise UserError("certificates: there must be at least one.")
@@ -51,20 +61,28 @@ def certify(
             f"policy: its hash is {digest[:12]}, not the declared {policy[:12]}; a certificate is "
             "for a policy that was fixed beforehand."
         )
+    drives(game, controller)
     key = stream(seed, "calibrate")
     V = cost_sum(game, controller, key) if V is None else V
-    if any(c.asks_V for c in certificates.values()):
-        require_zero(game, V, key)
-    sampled = sum(c.evidence == "statistical" for c in certificates.values())
+    left_out = refused(certificates, game, controller, V, key)
+    kept = {name: c for name, c in certificates.items() if name not in left_out}
+    if not kept:
+        raise UserError(" ".join(dict.fromkeys(left_out.values())))
+    sampled = sum(c.evidence == "statistical" for c in kept.values())
     each = bonferroni(confidence, max(1, sampled) * checkpoints)
-    asked = {name: dataclasses.replace(c, confidence=each) for name, c in certificates.items()}
-    verdicts = {}
+    asked = {name: dataclasses.replace(c, confidence=each) for name, c in kept.items()}
+    uses, verdicts = information(game, controller, key), {}
     for name, certificate in asked.items():
-        verdicts[name] = certificate.check(game, controller, V, seed)
+        begin(name)
+        verdict = certificate.check(game, controller, V, seed)
+        scope = verdict.scope | {"information": uses}
+        verdicts[name] = dataclasses.replace(verdict, scope=scope)
         tell(verdicts[name])
     return {
         "schema": 1,
-        "holds": all(v.holds for v in verdicts.values()),
+        "holds": all(v.holds for v in verdicts.values()) and {*left_out} <= {*optional},
+        "information": uses,
+        "left_out": left_out,
         "confidence": confidence,
         "confidence_each": each,
         "checkpoints": checkpoints,
@@ -78,8 +96,36 @@ def certify(
     }
 
 
+def refused(
+    certificates: Mapping[str, AbstractCertificate],
+    game: AbstractGame,
+    controller: Controller,
+    V: AbstractLyapunov,
+    key: Key,
+) -> dict[str, str]:
+    """Which certificates are not about such a game, controller or V, each with one sentence."""
+    reasons, zero = {}, None
+    if any(c.asks_V for c in certificates.values()):
+        zero = why_not(lambda: require_zero(game, V, key))
+    for name, certificate in certificates.items():
+        why = why_not(lambda c=certificate: c.refuse(game, controller, V))
+        why = why or (zero if certificate.asks_V else None)
+        if why is not None:
+            reasons[name] = why
+    return reasons
+
+
+def why_not(check: Callable[[], None]) -> str | None:
+    """The sentence of the UserError that `check` raises; None if it raises none."""
+    try:
+        check()
+    except UserError as error:
+        return str(error)
+    return None
+
+
 def save(
-    directory: Path,
+    directory: Path | str,
     result: Mapping[str, Any],
     game: AbstractGame,
     controller: Controller,

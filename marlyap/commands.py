@@ -18,8 +18,9 @@ from rich.table import Table
 from marlyap import config, film, store
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.algorithms import ALGORITHMS, PRESETS
-from marlyap.certificate import Verdict, sentence
+from marlyap.certificate import sentence
 from marlyap.certificates import CERTIFICATES
+from marlyap.certificates.safety import has_rules
 from marlyap.certify import certify, save
 from marlyap.conformance import conformance
 from marlyap.controllers import CONTROLLERS
@@ -248,7 +249,8 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
     out = args.out
     if args.run in CONTROLLERS:
         if game is None or out is None:
-            raise UserError(f"certify: {args.run} needs --task TASK and --out DIRECTORY.")
+            missing = "--task TASK" if game is None else "--out DIRECTORY"
+            raise UserError(f"certify: {args.run} is a controller, not a run; add {missing}.")
         controller: Any = CONTROLLERS[args.run](game)
     else:
         run = Run.open(expand([Path(args.run)])[0], game, algorithm)
@@ -256,8 +258,9 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
         out = out or run.directory / "certificate"
     if out.exists() and not args.force:
         raise UserError(f"out: {out} already exists; choose another or add --force.")
+    usual = (*SAMPLED, "linearisation", *(("safe",) if has_rules(game) else ()))
     chosen = {}
-    for name in args.certificates or (*SAMPLED, "linearisation"):
+    for name in args.certificates or usual:
         if name not in CERTIFICATES:
             hint = config.suggest(name, CERTIFICATES)
             raise UserError(f"certificates: there is none called '{name}'; {hint}")
@@ -270,11 +273,26 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
             f"V ignores errors below {V.ball:g} m: started on the target, this controller drifts "
             "that far."
         )
+    tell = say if args.json else print
 
-    def tell(verdict: Verdict) -> None:
-        (say if args.json else print)(f"[{verdict.evidence}] {sentence(verdict)}")
+    def begin(name: str) -> None:
+        if sys.stderr.isatty():  # each takes some seconds
+            say(f"{name} ...")
 
-    result = certify(game, controller, chosen, args.seed, args.confidence, V=V, tell=tell)
+    result = certify(
+        game,
+        controller,
+        chosen,
+        args.seed,
+        args.confidence,
+        V=V,
+        optional=() if args.certificates else usual,
+        begin=begin,
+        tell=lambda verdict: tell(f"[{verdict.evidence}] {sentence(verdict)}"),
+    )
+    for name, why in result["left_out"].items():
+        tell(f"[left out] {name}: {why}")
+    tell(f"Information: {result['information']}.")
     save(out, result, game, controller, V, replace=args.force)
     say(f"Certificate: {out}")
     return result | {"certificate": str(out)}, 0

@@ -219,7 +219,7 @@ def require_zero(game: AbstractGame, V: AbstractLyapunov, key: Array) -> None:
     worst, usual = float(jnp.max(jnp.abs(there))), float(jnp.median(jnp.abs(starts)))
     if not worst <= 1e-5 * max(usual, 1e-12):
         raise UserError(
-            f"V: {type(V).__name__} is {worst:.3g} on the target set, where it must be 0 (it is "
+            f"V, {V.meaning}, is {worst:.3g} on the target set, where it must be 0 (it is "
             f"{usual:.3g} at a usual start); take a V that is 0 there, or certificates "
             "that do not ask for one, such as reach."
         )
@@ -229,12 +229,13 @@ def cost_sum(game: AbstractGame, controller: Controller, key: Array) -> CostSum:
     """The T-step cost sum outside the smallest ball that the controller keeps from the target.
 
     Learnt policies keep moving a little there: what counts is leaving the ball. Its radius (m) is
-    that of the game, or two or four times that; for a controller that strays further the first.
+    that of the game, or two or four times that; for a controller that drifts further the first, and
+    `require_zero` refuses that V.
     """
     V = CostSum(controller=controller, ball=game.radius)
-    strays = float(_furthest(V, game, jax.random.split(key, 64)))
+    drift = float(_furthest(V, game, jax.random.split(key, 64)))
     balls = [game.radius * 2**k for k in range(3)]
-    return eqx.tree_at(lambda v: v.ball, V, next((b for b in balls if strays <= b), balls[0]))
+    return eqx.tree_at(lambda v: v.ball, V, next((b for b in balls if drift <= b), balls[0]))
 
 
 @eqx.filter_jit

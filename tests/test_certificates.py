@@ -23,11 +23,13 @@ from marlyap.certificates.closed_form import ClosedForm
 from marlyap.certificates.composition import Composition, fit_row
 from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
+from marlyap.certificates.information import information
 from marlyap.certificates.linearisation import Linearisation
-from marlyap.certificates.proof import Loop, Proof, extents, lyapunov
+from marlyap.certificates.proof import Loop, Proof, extents, halves, lyapunov
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness
+from marlyap.certificates.safety import Apart, Safe
 from marlyap.certificates.theorem1 import Theorem1, input_jacobian, l_f
 from marlyap.certify import certify, save
 from marlyap.controllers.point_offset import PointOffset
@@ -40,6 +42,7 @@ from marlyap.nets import Actors, Greedy, NormNet, Shape
 from marlyap.perturb import Perturbed
 from marlyap.rollout import Decentralised
 from marlyap.statistics import lower_bound
+from marlyap.tasks.formation import Formation
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State
 
@@ -225,7 +228,7 @@ def test_a_ball_is_taken_that_the_controller_keeps():
     assert not result["verdicts"]["reach"]["holds"]
 
 
-def test_only_claims_about_v_need_one():
+def test_what_needs_v_is_left_out_by_name_and_the_others_run():
     """Of a controller that leaves the target all that does not speak of V can still be said."""
     away = Straying(jnp.asarray(9 * POINT.radius))
     spoken = {name for name, c in TABLE.items() if c.asks_V}
@@ -233,7 +236,18 @@ def test_only_claims_about_v_need_one():
     for name in spoken:
         with pytest.raises(UserError, match="certificates that do not ask for one"):
             certified(POINT, away, {name: TABLE[name]})
-    assert not certified(POINT, away, {"reach": TABLE["reach"]})["holds"]
+    result = certified(POINT, away)
+    assert {*result["left_out"]} == spoken and {*result["verdicts"]} == {*TABLE} - spoken
+    assert all("on the target set" in why for why in result["left_out"].values())
+    # The confidence is shared by those that ran, and the left-out ones fail if asked for by name.
+    assert result["confidence_each"] == pytest.approx(1 - 0.01 / 3)
+    table = {"far": Apart(N, N), **{n: TABLE[n] for n in spoken}}
+    team = Rendezvous(agents=2, leaders=(0, 1), dynamics=SingleIntegrator(limits=(2.0, 2.0)))
+    table["far"] = dataclasses.replace(table["far"], least=1e-4)
+    asked = certified(team, Straying(jnp.asarray(0.9)), table)
+    usual = certified(team, Straying(jnp.asarray(0.9)), table, optional=table)
+    assert {*asked["verdicts"]} == {"far"} and {*usual["left_out"]} == spoken
+    assert not asked["holds"] and usual["holds"] == usual["verdicts"]["far"]["holds"]
 
 
 def test_bad_input_is_one_sentence():
@@ -521,10 +535,125 @@ def test_the_linearisation_says_no_to_the_unicycle():
     game = Rendezvous(agents=1)
     verdict = Linearisation().check(game, Idle(), CostSum(Idle()), 0)
     assert not verdict.holds and verdict.figures["controllability_rank"] == 4
-    assert verdict.claim.startswith("transverse-exponential: NO")
-    assert verdict.figures["uncontrollable_eigenvalues"] == [1.0]
+    assert verdict.claim.startswith("NO") and verdict.evidence == "proved"
+    assert verdict.figures["uncontrollable_eigenvalues"] == pytest.approx([1.0])
     assert Linearisation().check(POINT, Scripted(), CostSum(Idle()), 0).holds
     assert not Linearisation().check(POINT, Idle(), CostSum(Idle()), 0).holds
+
+
+class Holonomic(Rendezvous):
+    """Robots called unicycles that its own step moves straight to the goal, by 0.6 a step."""
+
+    def step(self, state, action):
+        p = state.goal + 0.6 * (state.x[:, :2] - state.goal)
+        x = jnp.concatenate([p, 0.6 * state.x[:, 2:]], axis=1)
+        return State(x=x + 0.0 * jnp.sum(action), goal=state.goal, t=state.t + 1)
+
+    def errors(self, state):
+        return jnp.concatenate([state.x[:, :2] - state.goal, state.x[:, 2:]], axis=1)
+
+    def reset(self, key):
+        start = super().reset(key)
+        return eqx.tree_at(lambda s: s.x, start, start.x.at[:, 2].set(0.0))
+
+
+def test_the_linearisation_is_of_the_games_own_step():
+    verdict = Linearisation().check(Holonomic(agents=1), Idle(), CostSum(Idle()), 0)
+    assert verdict.evidence == "observed" and verdict.holds
+    assert verdict.bound == pytest.approx(0.6, abs=1e-12)
+
+
+@pytest.mark.parametrize("A, fine", [(0.99, True), (0.9995, False), (0.99999994, False),
+                                     (1.0, False), (1.00001, False)])  # fmt: skip
+def test_the_linearisation_keeps_a_margin(A, fine):
+    verdict = Linearisation().check(flow([[A, 0.0], [0.0, A]]), Idle(), CostSum(Idle()), 0)
+    assert verdict.holds == fine
+
+
+def test_the_linearisation_asks_for_an_equilibrium_that_does_not_move():
+    beside = Linearisation().check(POINT, Straying(jnp.asarray(0.05)), CostSum(Idle()), 0)
+    assert not beside.holds and beside.claim.startswith("the goal is no equilibrium: on it the")
+    assert "agents move by 0.04 in a step" in beside.claim
+    late = Linearisation().check(POINT, Scripted(leave=jnp.asarray(45)), CostSum(Idle()), 0)
+    assert not late.holds and "depends on the time" in late.claim
+
+    class Drifting(Flow):
+        def step(self, state, action):
+            after = super().step(state, action)
+            return eqx.tree_at(lambda s: s.x, after, after.x + 0.01)
+
+    moving = Drifting(jnp.eye(2) * 0.5, jnp.asarray(0.0))
+    verdict = Linearisation().check(moving, Idle(), CostSum(Idle()), 0)
+    assert not verdict.holds and "without an action the agents move" in verdict.claim
+    kinked = lambda state, key: -3.0 * jnp.abs(state.x - state.goal)
+    verdict = Linearisation().check(POINT, kinked, CostSum(Idle()), 0)
+    assert not verdict.holds and "no derivative" in verdict.claim
+
+
+class Meeting(Flow):
+    """Two points on lines whose error is their gap alone: the target set is a line."""
+
+    agents: int = 2
+
+    def reset(self, key):
+        x = jax.random.normal(key, (2, 2))
+        return State(x=x, goal=jnp.zeros((2, 2)), t=jnp.asarray(0))
+
+    def errors(self, state):
+        return state.x - state.x[::-1]
+
+    def step(self, state, action):
+        x = state.x + 0.1 * (action - jnp.mean(action, axis=0, keepdims=True))
+        return State(x=x, goal=state.goal, t=state.t + 1)
+
+
+def test_an_eigenvalue_along_the_target_set_is_harmless():
+    """No input moves the mean of the two, and no error sees it: nothing is impossible."""
+    game = Meeting(jnp.eye(2), jnp.asarray(0.0))
+    verdict = Linearisation().check(game, lambda s, k: -(s.x - s.goal), CostSum(Idle()), 0)
+    assert verdict.figures["controllability_rank"] == 2 and not verdict.holds
+    assert verdict.figures["uncontrollable_eigenvalues"] == []
+    assert verdict.evidence == "observed" and "no stability is shown" in verdict.claim
+
+
+def test_formulas_are_about_their_own_model_only():
+    class Sticky(Rendezvous):
+        def step(self, state, action):
+            return super().step(state, 0.9 * action)
+
+    one, law = Sticky(agents=1), PointOffset(Sticky(agents=1))
+    with pytest.raises(UserError, match="Sticky has another `step`"):
+        ClosedForm().check(one, law, CostSum(law), 0)
+    policy = Decentralised(
+        policy_of(GAINS)[1].policy, Sticky(agents=1, dynamics=DoubleIntegrator())
+    )
+    with pytest.raises(UserError, match="another `step`"):
+        ANNULUS.check(policy.game, policy, FORM, 0)
+    other = Rendezvous(agents=1, dynamics=Unicycle(limits=(1.0, 1.0)))
+    with pytest.raises(UserError, match="made for another game"):
+        ClosedForm().check(Rendezvous(agents=1), PointOffset(other), CostSum(law), 0)
+
+    class Slippery(DoubleIntegrator):
+        def step(self, x, action, dt):
+            return 0.999 * super().step(x, action, dt)
+
+    with pytest.raises(UserError, match="not Slippery"):
+        game = Rendezvous(agents=1, dynamics=Slippery())
+        ANNULUS.check(game, Decentralised(policy.policy, game), FORM, 0)
+
+
+def test_a_proof_about_nothing_is_refused():
+    game, stable = policy_of(GAINS)
+    for wrong in (dict(c=1e6, rho=1e5, inner=1e5), dict(eta=-1.0), dict(eta=0.0)):
+        with pytest.raises(UserError, match="nothing to prove|V must fall"):
+            dataclasses.replace(ANNULUS, **wrong).check(game, stable, FORM, 0)
+
+
+def test_split_boxes_overlap_however_far_out():
+    boxes = np.array([[[1e3, 0.0, 0.0, 0.0], [1e-6, 0.0, 0.0, 0.0]]])
+    left, right = halves(boxes, np.ones((1, 4)))
+    assert left[0, 0] + left[1, 0] > right[0, 0] - right[1, 0]
+    assert left[0, 0] - left[1, 0] < 1e3 - 1e-6 and right[0, 0] + right[1, 0] > 1e3 + 1e-6
 
 
 def policy_of(K, hidden=16):
@@ -613,3 +742,95 @@ def test_the_bounds_of_the_unicycle_hold_at_random_points(kind):
     f, V0, V1 = (np.asarray(a, float) for a in jax.vmap(truth)(jnp.asarray(x)))
     for bound, value in ((moved, f), (before, V0), (after, V1), (change, V1 - V0)):
         assert (bound.low <= value + 1e-5).all() and (value <= bound.high + 1e-5).all()
+
+
+class Rules(Rendezvous):
+    """Two points that have to keep apart, and may violate a rule of their own."""
+
+    gap: float = 0.5
+
+    def violations(self, state):
+        return self.crowded(state, self.gap)
+
+
+def steady(state, key):
+    """Nobody moves."""
+    return jnp.zeros((2, 2))
+
+
+def test_safe_counts_rollouts_in_which_a_rule_is_broken():
+    points = dict(agents=2, leaders=(0, 1), dynamics=SingleIntegrator((2.0, 2.0)))
+    few = Safe(rollouts=N, share=0.8)
+    meets = few.check(Rules(**points), lambda s, k: s.goal - s.x, CostSum(Idle()), 0)
+    assert not meets.holds and meets.successes == 0 and meets.worst["failed"]
+    still = few.check(Rules(**points, gap=0.2), steady, CostSum(Idle()), 0)
+    # Two points uniform in a square of side 2 are closer than r with probability pi r^2 / 4, less
+    # what lies outside.
+    assert still.holds and still.successes / N == pytest.approx(1 - 0.0293, abs=0.02)
+    assert "no agent breaks a rule of Rules" in still.claim and "until step 80 (8 s)" in still.claim
+
+
+def test_safe_refuses_a_game_without_a_rule():
+    with pytest.raises(UserError, match="Rendezvous has no rule to break"):
+        Safe().check(POINT, Scripted(), CostSum(Idle()), 0)
+    with pytest.raises(UserError, match="Formation never fire"):
+        Safe().check(Formation(), Scripted(), CostSum(Idle()), 0)
+    result = certified(POINT, Scripted(), {"reach": TABLE["reach"], "safe": Safe()})
+    assert "no rule to break" in result["left_out"]["safe"] and not result["holds"]
+
+
+def test_apart_finds_the_gap_and_tests_it_on_fresh_starts():
+    points = dict(agents=2, leaders=(0, 1), dynamics=SingleIntegrator((2.0, 2.0)))
+    verdict = Apart(rollouts=N, calibration=N, share=0.8).check(
+        Rules(**points), steady, CostSum(Idle()), 0
+    )
+    gap = verdict.figures["gap"]
+    assert verdict.holds and 0.3 < gap < 0.6 and f"closer than {gap:g} m" in verdict.claim
+    meets = Apart(rollouts=N, calibration=N).check(
+        Rules(**points), lambda s, k: s.goal - s.x, CostSum(Idle()), 0
+    )
+    assert not meets.holds and "less than the 0.01 m asked" in meets.claim
+    with pytest.raises(UserError, match="team of one"):
+        Apart().check(POINT, Scripted(), CostSum(Idle()), 0)
+
+
+PATH = Rendezvous(graph="path", dynamics=SingleIntegrator())  # 0 leads, 2 is linked to 1 alone
+PATH_OBS = PATH.observations(PATH.reset(jax.random.key(0))).shape[1]
+
+
+def local(state):
+    """Everybody goes to the mean of itself and its neighbours, the leader to its goal."""
+    x, link = state.x, jnp.asarray(np.eye(3) + PATH.adjacency, jnp.float32)
+    pull = link @ x / jnp.sum(link, axis=1, keepdims=True) - x
+    return pull.at[0].add(state.goal[0] - x[0])
+
+
+@pytest.mark.parametrize(
+    "act, found",
+    [
+        (local, "each agent acts on itself and its neighbours"),
+        (lambda s: local(s) * (1.0 - (s.t > 80)), "agent 0's action changes with the time"),
+        (lambda s: s.goal - s.x, "agent 1's action changes with the target that it is not told"),
+        (lambda s: local(s) + s.goal[1:2], "agent 0's action changes with the target of agent 1"),
+        (lambda s: local(s).at[0].add(s.x[2]), "agent 0's action changes with agent 2, which"),
+    ],
+)  # fmt: skip
+def test_information_is_found_by_test(act, found):
+    said = information(PATH, lambda s, k: act(s), jax.random.key(0))
+    assert said.startswith(found) or said.startswith(f"NOT decentralised: {found}")
+
+
+def test_information_of_policies_and_of_a_verdict():
+    actors = Actors(Shape(3, PATH_OBS, 6, 2, 2), 8, key=jax.random.key(0))
+    alone = Decentralised(Greedy(actors), PATH)
+    assert information(PATH, alone, jax.random.key(0)) == "each agent acts on its own observation"
+
+    class Summed(eqx.Module):
+        def __call__(self, obs, key):
+            return jnp.tanh(jnp.sum(obs, axis=0, keepdims=True)[:, :2]) * jnp.ones((3, 1))
+
+    said = information(PATH, Decentralised(Summed(), PATH), jax.random.key(0))
+    assert said == "NOT decentralised: agent 0's action changes with agent 1's observation"
+    result = certified(POINT, Scripted(leave=jnp.asarray(33)), {"reach": TABLE["reach"]})
+    assert "with the time" in result["information"]
+    assert result["verdicts"]["reach"]["scope"]["information"] == result["information"]

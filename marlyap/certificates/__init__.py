@@ -10,6 +10,7 @@ from marlyap.certificates.linearisation import Linearisation
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness
+from marlyap.certificates.safety import Apart, Safe
 from marlyap.certificates.theorem1 import Theorem1
 
 
@@ -20,6 +21,8 @@ CERTIFICATES: dict[str, AbstractCertificate] = {
     "contraction": Contraction(),
     "basin": Basin(),
     "quantiles": Quantiles(),
+    "safe": Safe(),
+    "apart": Apart(),
     "robustness": Robustness(),
     "theorem1": Theorem1(),
     "composition": Composition(),

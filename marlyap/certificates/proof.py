@@ -5,18 +5,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
+import jax
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
 from marlyap import store
 from marlyap.certificate import AbstractCertificate, Evidence, Verdict
-from marlyap.certificates import bounds as B
+from marlyap.certificates import bounds as B, model
 from marlyap.certificates.bounds import Affine
 from marlyap.dynamics import DoubleIntegrator, Unicycle
 from marlyap.errors import UserError
 from marlyap.identity import policy_hash
 from marlyap.lyapunov_function import Approach, Norm, Quadratic
+from marlyap.nets import Actors, Greedy
+from marlyap.rollout import Decentralised
+from marlyap.types import State
 
 
 SAVE_EVERY = 10.0  # seconds
@@ -52,8 +56,29 @@ class Proof(AbstractCertificate):
     evidence: ClassVar[Evidence] = "proved"
     asks_V: ClassVar[bool] = True
 
+    def refuse(self, game, controller, V):
+        half = np.array(self.half)
+        if len(half) != 4 or not 0 < self.rho <= self.inner <= self.c or not (half > 0).all():
+            raise UserError("proof: four half widths and 0 < rho <= inner <= c are needed.")
+        if not (self.eta >= 0 and 0 <= self.decay < 1 and self.eta + self.decay > 0):
+            raise UserError("proof: V must fall; take eta >= 0 and decay in [0, 1), not both 0.")
+        loop = Loop(game, controller)
+        lyapunov(V, game.radius)
+        heading = [np.pi] if loop.turns else []
+        states = model.drawn(game, np.array([0.0, 0.0, *heading, *half[2:]]), self.goals())
+        answer = lambda states: loop(reduced(game, states)).b[:, None]
+        errors = lambda game, state: game.errors(state)
+        model.require_step("proof", game, controller, states, answer, errors)
+
+    def goals(self) -> np.ndarray:
+        """Goals [sample, 1, 2] of one agent at the origin, as far as the box reaches (m)."""
+        shape = (model.SAMPLES, 1, 2)
+        return np.random.default_rng(1).uniform(-1, 1, shape) * np.array(self.half[:2])
+
     def check(self, game, controller, V, seed):
+        self.refuse(game, controller, V)
         loop, V_of = Loop(game, controller), lyapunov(V, game.radius)
+        self.require_content(V_of)
         todo, looked, settled = self.begin(controller, V)
         found, total = None, float(np.prod(2 * np.array(self.half)))
         saved = time.monotonic()
@@ -73,7 +98,18 @@ class Proof(AbstractCertificate):
         self.keep(todo, looked, settled, controller, V)
         left = 1.0 - settled / total if len(todo) else 0.0
         answer = "refuted" if found else "undecided" if len(todo) else "proved"
-        return self.verdict(game, answer, found, looked, left, len(todo))
+        return self.verdict(game, V, answer, found, looked, left, len(todo))
+
+    def require_content(self, V_of: Callable[[Affine], Affine]) -> None:
+        """Raise UserError unless the box holds states with rho <= V <= c."""
+        way = np.random.default_rng(0).uniform(-1, 1, (200, 1, 4)) * np.array(self.half)
+        x = (way * np.linspace(0, 1, 50)[None, :, None]).reshape(-1, 4)
+        V = V_of(B.box(x, np.zeros_like(x)))
+        if not ((V.low >= self.rho) & (V.high <= self.c)).any():
+            raise UserError(
+                f"half: no state of the box with {self.rho:g} <= V <= {self.c:g} was found: "
+                "nothing to prove; take a larger box, or other levels."
+            )
 
     def settle(
         self, now: np.ndarray, loop: "Loop", V_of: Callable[[Affine], Affine]
@@ -113,8 +149,6 @@ class Proof(AbstractCertificate):
     def begin(self, controller: Any, V: Any) -> tuple[np.ndarray, int, float]:
         """The whole box, or what an earlier run left of it."""
         half = np.array(self.half)
-        if len(half) != 4 or not 0 < self.rho <= self.inner <= self.c or not (half > 0).all():
-            raise UserError("proof: four half widths and 0 < rho <= inner <= c are needed.")
         start = np.stack([np.zeros_like(half), half])[None]
         if self.resume is None or not Path(self.resume).exists():
             return start, 0, 0.0
@@ -141,12 +175,12 @@ class Proof(AbstractCertificate):
         fast = np.log(self.c / self.rho) / -np.log1p(-self.decay) if self.decay > 0 else np.inf
         return int(np.ceil(min(slow, fast)))
 
-    def verdict(self, game, answer, found, looked, left, boxes) -> Verdict:
+    def verdict(self, game, V, answer, found, looked, left, boxes) -> Verdict:
         claim = (
-            f"{answer}: in one step of {game.dt:g} s V falls by {100 * self.decay:g} % and "
-            f"{self.eta:g} from every state with {self.rho:g} <= V <= {self.c:g}, so that "
-            f"{{V <= {self.rho:g}}} is entered within {self.steps} steps; and {{V <= "
-            f"{self.inner:g}}} is not left from there"
+            f"{answer}: in one step of {game.dt:g} s V, {V.meaning}, falls by {100 * self.decay:g} "
+            f"% and {self.eta:g} from every state with {self.rho:g} <= V <= {self.c:g} within |x| "
+            f"<= {self.half}, so that {{V <= {self.rho:g}}} is entered within {self.steps} steps; "
+            f"and {{V <= {self.inner:g}}} is not left from there"
         )
         return Verdict(
             name="proof",
@@ -168,16 +202,16 @@ class Loop:
     """f(x) = one step under the controller, for boxes of reduced states."""
 
     def __init__(self, game: Any, controller: Any):
-        model = game.dynamics
-        known = type(model) in (Unicycle, DoubleIntegrator) and model.integrator == "euler"
-        pi = getattr(getattr(controller, "policy", None), "pi", None)
-        if game.agents != 1 or not known or pi is None:
+        trained = type(controller) is Decentralised and type(controller.policy) is Greedy
+        if game.agents != 1 or not trained or type(controller.policy.pi) is not Actors:
             raise UserError(
                 "proof: only a trained policy of one agent, unicycle or double integrator with "
                 "Euler steps, can be proved; set agents=1."
             )
+        model.require_model("proof", game, controller, (Unicycle, DoubleIntegrator))
+        pi = controller.policy.pi
         self.dt, self.scale = game.dt, game.radius
-        self.limits, self.turns = model.limits, isinstance(model, Unicycle)
+        self.limits, self.turns = game.dynamics.limits, type(game.dynamics) is Unicycle
         self.layers = weights(pi.net, None if pi.shared else 0)
 
     def __call__(self, x: Affine) -> Affine:
@@ -196,6 +230,12 @@ class Loop:
     def policy(self, e: Affine, rates: Affine) -> Affine:
         seen = B.join(rates, B.constant(1.0, e), e, magnified(e, self.scale))
         return B.tanh(forward(self.layers, seen).pick([0, 1]))
+
+
+def reduced(game: Any, states: State) -> Affine:
+    """The reduced coordinates of states [sample] as boxes without extent, in float64."""
+    x = np.asarray(jax.vmap(game.errors)(states), float)[:, 0]
+    return B.box(x, np.zeros_like(x))
 
 
 def magnified(e: Affine, scale: float) -> Affine:
@@ -266,12 +306,13 @@ def extents(V: Any, level: np.ndarray, half: np.ndarray) -> np.ndarray:
 
 
 def halves(boxes: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Each box in two, across its widest side relative to `wide`, overlapping by a rounding."""
+    """Each box in two, across its widest side relative to `wide`, overlapping by some roundings."""
     k, axis = np.arange(len(boxes)), np.argmax(boxes[:, 1] / wide, axis=1)
     left, right = boxes.copy(), boxes.copy()
     quarter = boxes[k, 1, axis] / 2
     left[k, 0, axis] -= quarter
     right[k, 0, axis] += quarter
     for part in (left, right):
-        part[k, 1, axis] = quarter * (1 + 1e-12)
+        # By more than the rounding of the centre, however far out it lies.
+        part[k, 1, axis] = quarter * (1 + 1e-12) + 1e-15 * np.abs(boxes[k, 0, axis])
     return np.concatenate([left, right])

@@ -1,0 +1,83 @@
+"""Is the game the model that a formula is about? Asked before anything is proved by formulas."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from marlyap.certificates.linearisation import as_double
+from marlyap.dynamics import AbstractDynamics
+from marlyap.errors import UserError
+from marlyap.game import AbstractGame
+from marlyap.identity import plain
+from marlyap.rollout import Controller
+from marlyap.tasks.rendezvous import Rendezvous
+from marlyap.types import State
+
+
+# What the formulas take for granted of Rendezvous: one that replaces any of it is another game.
+PARTS = ("step", "observe", "observations", "local_view", "linked", "adjacency", "slots", "leads")
+PARTS += ("errors", "distance", "positions", "success", "terminated")
+SAMPLES = 256
+ROUNDING = 1e-9  # in float64, of states of the size of metres
+
+
+def require_model(
+    name: str, game: AbstractGame, controller: Any, kinds: tuple[type[AbstractDynamics], ...]
+) -> None:
+    """Raise UserError unless the game is Rendezvous as it stands, and the controller's game too."""
+    other = [part for part in PARTS if getattr(type(game), part) is not getattr(Rendezvous, part)]
+    if other:
+        raise UserError(
+            f"{name}: its formulas are about Rendezvous, and {type(game).__name__} has another "
+            f"`{other[0]}`; take a certificate that plays the game, such as reach."
+        )
+    if type(game.dynamics) not in kinds or game.dynamics.integrator != "euler":
+        known = " or ".join(kind.__name__ for kind in kinds)
+        raise UserError(
+            f"{name}: its formulas are about {known} with Euler steps, not "
+            f"{type(game.dynamics).__name__} with {game.dynamics.integrator}."
+        )
+    if plain(controller.game) != plain(game):
+        raise UserError(f"{name}: the controller was made for another game than this one.")
+
+
+def require_step(
+    name: str,
+    game: AbstractGame,
+    controller: Controller,
+    states: State,
+    model: Callable[[State], np.ndarray],
+    of: Callable[[AbstractGame, State], Any],
+) -> None:
+    """Raise UserError unless the game's own step under the controller is the model's, in float64.
+
+    Arguments: states [sample], in the region that is spoken of; model, the model's answer for all
+    of them [sample, ...]; of, the game's, from the state after one step.
+    """
+    with jax.enable_x64(True):
+        game, controller, states = as_double(game), as_double(controller), as_double(states)
+
+        @jax.jit
+        def after(states: State) -> Any:
+            one = lambda s: of(game, game.step(s, controller(s, jax.random.key(0))))
+            return jax.vmap(one)(states)
+
+        mine, theirs = np.asarray(after(states), float), model(states)
+    gap = float(np.max(np.abs(mine - theirs)))
+    if not gap <= ROUNDING * (1 + float(np.max(np.abs(theirs)))):
+        raise UserError(
+            f"{name}: a step of {type(game).__name__} ends {gap:.3g} beside the formula's; it is "
+            "not about this game."
+        )
+
+
+def drawn(game: AbstractGame, spread: np.ndarray, goals: np.ndarray, seed: int = 0) -> State:
+    """States [sample] with x uniform in +- `spread` [dx] of every agent."""
+    rng, shape = np.random.default_rng(seed), (SAMPLES, game.agents, len(spread))
+    x = rng.uniform(-1.0, 1.0, shape) * spread
+    with jax.enable_x64(True):
+        one = lambda x, goal: State(x=x, goal=goal, t=jnp.asarray(0))
+        return jax.vmap(one)(jnp.asarray(x), jnp.asarray(goals))
