@@ -215,11 +215,11 @@ def worst_of(
     game: AbstractGame, seed: int, purpose: Purpose, found: Found, among: Any = None
 ) -> dict[str, Any]:
     """The rollout that failed worst, or came closest to failing, as a start to replay."""
+    rivals = np.ones(len(found.holds), bool) if among is None else among
+    if (rivals & ~found.holds).any():
+        rivals = rivals & ~found.holds
     badness = np.clip(found.badness.astype(float), -1e29, 1e29)
-    rank = np.where(found.holds, badness, badness + 1e30)
-    if among is not None:
-        rank = np.where(among, rank, -np.inf)
-    episode = int(np.argmax(rank))
+    episode = int(np.argmax(np.where(rivals, badness, -np.inf)))
     start = start_of(game, seed, purpose, episode)
     figures = {name: float(np.asarray(values)[episode]) for name, values in found.figures.items()}
     return {

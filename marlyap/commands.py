@@ -299,14 +299,27 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
 
 
 def recheck_certificate(args: Namespace, overrides: Overrides) -> Result:
-    """`recheck`: reject the certificate or confirm its figures."""
-    tell = (lambda name: None) if args.json else (lambda name: print(f"{name}: agrees", flush=True))
+    """`recheck`: reject the certificate, or say of each verdict that it agrees.
+
+    The exit code is 0 only if every verdict was derived again, and 1 where some could not be.
+    """
+
+    def tell(name: str, verdict: dict[str, Any]) -> None:
+        if not args.json:
+            mark = "holds" if verdict["holds"] else "does not hold"
+            print(f"{name} agrees: {verdict['claim']}: {mark}.", flush=True)
+
     result = recheck(args.certificate, tell)
+    done, left = len(result["rechecked"]), result["not_rechecked"]
     if not args.json:
-        print(f"{args.certificate}: derived again, {len(result['rechecked'])} certificates agree.")
-        if result["not_rechecked"]:
-            print(f"Not looked at: {', '.join(result['not_rechecked'])}.")
-    return result, 0
+        for name, why in left.items():
+            print(f"NOT CHECKED: {name}: {why}.")
+        print(
+            f"{args.certificate}: {done} of {done + len(left)} verdicts were derived again; ",
+            end="",
+        )
+        print("the file as a whole is not confirmed." if left else "all agree.")
+    return result, int(not result["agrees"])
 
 
 def check_task(args: Namespace, overrides: Overrides) -> Result:

@@ -39,9 +39,14 @@ def without_arrays(tree: Any) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Modules, arrays and numbers as JSON values; what is not finite becomes null."""
+    """Modules, arrays and numbers as JSON values; what is not finite becomes null.
+
+    The kind of a module is the name of its class, with "(own code)" behind it where the class is
+    not marlyap's: no code of a user's own passes for what bears the same name here.
+    """
     if isinstance(value, eqx.Module):
-        kind = {"kind": type(value).__name__}
+        ours = type(value).__module__.startswith("marlyap.")
+        kind = {"kind": type(value).__name__ + ("" if ours else " (own code)")}
         fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
         return kind | plain(fields)
     if isinstance(value, dict):

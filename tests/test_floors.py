@@ -24,7 +24,6 @@ FLOORS = """
     programs
     threefry
     graph
-    replica
     recheck
     dynamics
     sensing
