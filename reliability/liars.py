@@ -3,10 +3,10 @@
     ./run python reliability/liars.py            every liar, and the sentence it is answered with
     ./run python reliability/liars.py --quick    fewer rollouts: what the tests run
 
-A liar would like to hear that something holds, is proved or agrees, which is false. It is caught if
-it is refused, if the verdict does not hold, or, where the sentence is true and the lie is in what it
-does not say, if the sentence says that too. Each kind of liar has an honest twin which has to pass:
-a tool that refuses everybody catches nobody. Exit code 1 if a liar passed or an honest one did not.
+A liar would like to hear that something false holds, is proved or agrees. It is caught if it is
+refused or if the verdict does not hold; where the lie is in what a true sentence leaves out, if the
+sentence says that too. Each kind of liar has an honest twin that has to pass: a tool that refuses
+everybody catches nobody. Exit code 1 if a liar passed or an honest one did not.
 """
 
 import argparse
@@ -125,11 +125,11 @@ def law(game: AbstractGame, name: str) -> Answer:
     return Answer(not faults, faults[0] if faults else f"keeps the law {name}")
 
 
-# --- Plants ----------------------------------------------------------------------------------------
+# --- Plants -------------------------------------------------------------------------------------
 
 
 class Plant(Rendezvous):
-    """One agent, x+ = growth x + dt u; started in a square of `size` round the goal at the origin."""
+    """One agent, x+ = growth x + dt u, started in a square of side 2 `size` round its goal 0."""
 
     agents: int = 1
     growth: float = 1.0
@@ -161,7 +161,7 @@ class Push(eqx.Module):
 GOOD = Push(gain=3.0)
 
 
-# --- Linearisation ---------------------------------------------------------------------------------
+# --- Linearisation ------------------------------------------------------------------------------
 
 
 @case("linearisation", "a stable loop at rest on its goal", honest=True)
@@ -245,7 +245,7 @@ def _(n):
     return Answer(verdict["evidence"] == "proved" and not verdict["holds"], verdict["claim"])
 
 
-# --- Composition -----------------------------------------------------------------------------------
+# --- Composition --------------------------------------------------------------------------------
 
 small_gain = lambda n: Composition(rollouts=n, calibration=n)
 
@@ -267,7 +267,7 @@ for name, growth, size in (
         return verdicts(Plant(growth=growth, size=size), Push(), small_gain(n))
 
 
-# --- Sampled certificates --------------------------------------------------------------------------
+# --- Sampled certificates -----------------------------------------------------------------------
 
 reach = lambda n: Reach(rollouts=n, share=0.95)
 stay = lambda n: ReachAndStay(rollouts=n, share=0.95)
@@ -384,7 +384,7 @@ def _(n):
     return verdicts(Plant(growth=30.0), Push(), quantile(n))
 
 
-# --- Lyapunov functions ----------------------------------------------------------------------------
+# --- Lyapunov functions -------------------------------------------------------------------------
 
 
 class V(AbstractLyapunov):
@@ -393,10 +393,11 @@ class V(AbstractLyapunov):
     lie: str = ""
     ball: float = 0.0
     beyond = property(lambda self: 0)  # pyright: ignore[reportAssignmentType]
+    meaning = property(lambda self: "|e|")  # pyright: ignore[reportAssignmentType]
 
     def value(self, game, state):
         e = jnp.max(game.distance(state))
-        there = (state.x[0, 0] > 0.9) & (state.x[0, 1] > 0.9)  # a corner of the starts
+        there = (state.x[0, 0] > 0.6) & (state.x[0, 1] > 0.6)  # a corner of the starts
         return {
             "": e,
             "negative": jnp.where(there, -e, e),
@@ -432,7 +433,7 @@ def _(n):
     return verdicts(Plant(), Push(), fall(n), V("nowhere"))
 
 
-# --- What the agents act on ------------------------------------------------------------------------
+# --- What the agents act on ---------------------------------------------------------------------
 
 PATH = Rendezvous(graph="path", dynamics=SingleIntegrator((2.0, 2.0)))
 
@@ -499,7 +500,7 @@ for name, controller in (
         return verdicts(PATH, controller, reach(n), must_say="NOT decentralised")
 
 
-# --- Tasks -----------------------------------------------------------------------------------------
+# --- Tasks --------------------------------------------------------------------------------------
 
 
 class Crash(Formation):
@@ -645,7 +646,7 @@ def _(n):
     return refused(lambda: certify(Plant(), GOOD, table, 1, 0.99, policy=declared))
 
 
-# --- Forged certificates ---------------------------------------------------------------------------
+# --- Forged certificates ------------------------------------------------------------------------
 
 
 def forge(change: Callable[[dict], None], rollouts: int, seal: bool = True) -> Answer:
@@ -769,7 +770,7 @@ def _(n):
         return refused(lambda: recheck(Path(folder) / "c"))
 
 
-# --- The table -------------------------------------------------------------------------------------
+# --- The table ----------------------------------------------------------------------------------
 
 
 def answers(rollouts: int, kinds: set[str] | None = None) -> Iterator[tuple[Case, Answer]]:
