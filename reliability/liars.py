@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 
 from marlyap.algorithms.sac import Joint
-from marlyap.certificate import sentence
+from marlyap.certificate import Verdict, sentence
 from marlyap.certificates.basin import Basin
 from marlyap.certificates.closed_form import ClosedForm
 from marlyap.certificates.composition import Composition
@@ -91,23 +91,11 @@ def verdicts(
     except UserError as error:
         return Answer(False, f"refused: {error}")
     (verdict,) = result["verdicts"].values()
-    says = sentence(_Plain(**{k: verdict[k] for k in _Plain.__annotations__}))
+    says = sentence(Verdict(**verdict))
     if must_say is not None:
         says += f" [{result['information']}]"
         return Answer(must_say not in says, says)
     return Answer(bool(result["holds"] and verdict["holds"]), says)
-
-
-@dataclass(frozen=True)
-class _Plain:
-    """A stored verdict, as `sentence` reads it."""
-
-    name: str
-    claim: str
-    holds: bool
-    bound: float | None
-    confidence: float | None
-    figures: dict[str, Any]
 
 
 def refused(call: Callable[[], Any]) -> Answer:
