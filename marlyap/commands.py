@@ -306,7 +306,7 @@ def cells(row: dict[str, Any], ruled: bool) -> list[str]:
     ]
 
 
-def one_run(word: str) -> Path:
+def one_run(word: Path | str) -> Path:
     """The one run at this place. Raises UserError where there is none, or several."""
     found = expand([Path(word)])
     if len(found) > 1:
