@@ -54,7 +54,7 @@ def train(args: Namespace, overrides: Overrides) -> Result:
         given = {"--seeds": args.seeds, "--steps": args.steps, "--preset": args.preset}
         given |= {"--out": args.out, "--force": args.force or None}
         for option in [k for k, v in given.items() if v is not None]:
-            raise UserError(f"{option}: a run that is resumed goes on as it is; leave it out.")
+            raise UserError(f"{option}: a resumed run keeps its settings; leave it out.")
         args.task, args.algorithm = args.task or args.own_task, args.algorithm or args.own_algorithm
         if overrides:
             raise UserError(f"--{next(iter(overrides))}: a run that is resumed keeps its settings.")
