@@ -39,6 +39,7 @@ from marlyap.certificates.quantiles import NAMES, Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness
 from marlyap.certificates.safety import Apart, Safe
+from marlyap.certificates.theorem1 import Theorem1, _Tuple
 from marlyap.dynamics import AbstractDynamics, SingleIntegrator
 from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import CostSum
@@ -235,6 +236,7 @@ KINDS: dict[str, AbstractCertificate] = {
     "basin": Basin(**CHOSEN),
     "quantiles": Quantiles(rollouts=200, q=0.9, confidence=ASKED),
     "composition": Composition(**CHOSEN),
+    "theorem1": Theorem1(**FEW, noise=0.1),
     "robustness": Robustness(
         **FEW, gains=(), noises=(1.0,), delays=(), drops=(), spreads=(0.7, 1.5), remove=False
     ),
@@ -261,6 +263,8 @@ def truths(rollouts: int) -> dict[str, Callable[[Verdict], bool]]:
     ends = seen(KINDS["quantiles"].judge, H + V.beyond, rollouts).figures  # pyright: ignore
     C = Composition()
     windows = seen(_Windows(C.T), late + C.T, rollouts // 4, COMING).figures["V"]
+    one = _Tuple(IDLE, None, KINDS["theorem1"].noise)  # pyright: ignore
+    tuples = seen(one, H + V.beyond, rollouts).figures
     curve = {
         name: float(np.mean(seen(Reach().judge, H, rollouts, perturbed(change)).holds))
         for name, change in KINDS["robustness"].perturbations(GAME).items()  # pyright: ignore
@@ -280,6 +284,11 @@ def truths(rollouts: int) -> dict[str, Callable[[Verdict], bool]]:
         M, delta = (np.asarray(v.figures[name]) for name in ("M", "delta"))
         return v.bound <= np.mean(worst_excess(windows, M, delta, C.T) <= 0)
 
+    def theorem1(v: Verdict) -> bool:
+        excess = tuples["next_V"] - tuples["V"]
+        excess = excess + v.figures["l_L"] * v.figures["l_f"] * tuples["moved"]
+        return v.bound <= np.mean((excess <= 0)[tuples["outside"] > 0])
+
     robust = lambda v: all(p["bound"] <= curve[p["perturbation"]] for p in v.figures["curve"])
     return {
         "reach": share(Reach().judge, H),
@@ -291,6 +300,7 @@ def truths(rollouts: int) -> dict[str, Callable[[Verdict], bool]]:
         "basin": basin,
         "quantiles": quantiles,
         "composition": composition,
+        "theorem1": theorem1,
         "robustness": robust,
     }
 
