@@ -27,7 +27,7 @@ from marlyap.certificates import CERTIFICATES
 from marlyap.certificates.safety import has_rules
 from marlyap.certify import certify, save
 from marlyap.conformance import conformance
-from marlyap.controllers import CONTROLLERS, load as load_controller, names_a_controller
+from marlyap.controllers import CONTROLLERS, names_a_controller
 from marlyap.errors import UserError, within
 from marlyap.evaluation import RESTS, evaluate
 from marlyap.game import AbstractGame
@@ -54,7 +54,7 @@ def train(args: Namespace, overrides: Overrides) -> Result:
         given = {"--seeds": args.seeds, "--steps": args.steps, "--preset": args.preset}
         given |= {"--out": args.out, "--force": args.force or None}
         for option in [k for k, v in given.items() if v is not None]:
-            raise UserError(f"{option}: a run that is resumed goes on as it is; leave it out.")
+            raise UserError(f"{option}: a resumed run keeps its settings; leave it out.")
         args.task, args.algorithm = args.task or args.own_task, args.algorithm or args.own_algorithm
         if overrides:
             raise UserError(f"--{next(iter(overrides))}: a run that is resumed keeps its settings.")
@@ -176,7 +176,7 @@ def measure(args: Namespace, overrides: Overrides) -> Result:
         if names_a_controller(word):
             if game is None:
                 raise UserError(f"task: {word} needs --task, the task it is to be measured on.")
-            result = evaluate(game, load_controller(word, game), args.episodes, starts)
+            result = evaluate(game, config.load_controller(word, game), args.episodes, starts)
             found.append(groups.of_controller(word.rpartition(":")[2], game, result, starts))
         elif Path(word).exists():
             directories.append(Path(word))
@@ -329,7 +329,7 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
             missing = "--task TASK" if args.task is None else "--out DIRECTORY"
             raise UserError(f"certify: {args.run} is a controller, not a run; add {missing}.")
         game = asked(args.task, overrides)
-        controller: Any = load_controller(args.run, game)
+        controller: Any = config.load_controller(args.run, game)
     else:
         place = one_run(args.run)
         run, game = subject(place, args.task, args.algorithm, overrides)

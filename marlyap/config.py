@@ -24,6 +24,7 @@ from marlyap.algorithm import AbstractAlgorithm
 from marlyap.algorithms import ALGORITHMS
 from marlyap.constraint import AbstractConstraint
 from marlyap.constraints import CONSTRAINTS
+from marlyap.controllers import CONTROLLERS, AbstractController
 from marlyap.dynamics import DYNAMICS, AbstractDynamics
 from marlyap.errors import UserError, first_line, raised_at, whole
 from marlyap.game import AbstractGame
@@ -111,6 +112,34 @@ def _annotated(cls: type) -> None:
                 raise UserError(
                     f"{cls.__name__}: {name} = {shown} needs a type: {name}: {kind} = {shown}."
                 )
+
+
+def load_controller(word: str, game: AbstractGame) -> AbstractController:
+    """The controller called `word`, or the one at `path/to/file.py:Name`, for this game.
+
+    A file is executed: name your own. Raises UserError for an unknown name (with a suggestion), a
+    file that cannot be loaded, a class that is no controller, and a game that it cannot drive.
+    """
+    if word in CONTROLLERS:
+        return CONTROLLERS[word](game)
+    path, _, name = word.rpartition(":")
+    if word.endswith(".py"):
+        raise UserError(f"controller: '{word}' names no class; write {word}:Name.")
+    if not path:
+        hint = suggest(word, CONTROLLERS)
+        raise UserError(f"controller: no controller is called '{word}'; {hint}")
+    cls = getattr(_module(Path(path), "controller"), name, None)
+    if not (inspect.isclass(cls) and issubclass(cls, AbstractController)):
+        raise UserError(
+            f"controller: {path} defines no controller called '{name}'; write a class "
+            f"{name}(AbstractController)."
+        )
+    try:
+        return cls(game)
+    except UserError:
+        raise
+    except Exception as error:  # whatever the constructor of a user's class may raise
+        raise UserError(f"controller: {name} cannot be made from a game alone: {error}.") from error
 
 
 def override(obj: T, path: str, text: str) -> T:

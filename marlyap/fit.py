@@ -43,7 +43,7 @@ def fit(
     """Train `runs` to the end, or until `stop()`; yields one dict for each run and iteration.
 
     Several runs must differ in their seed alone; they advance together under `vmap`. Everything
-    is saved at the end and when stopped, so that calling this again goes on bit for bit. A run in
+    is saved at the end and when stopped, so that calling this again resumes bit for bit. A run in
     which a number stops being finite is given up, the others go on; with more `attempts` it is
     taken up again, from its last checkpoint and with other random numbers.
     Raises Diverged (a UserError) if this was so in every run to the last.

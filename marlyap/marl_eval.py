@@ -4,7 +4,7 @@
                                                absolute_metrics   -> metrics
 
 A metric is a list: here of one number, the mean over the episodes. The absolute metrics are those
-of the policy that is handed out, measured on fresh starts after training.
+of the deployed policy, measured on held-out starts after training.
 
 Source: Gorsane et al., "Towards a standardised performance evaluation protocol for cooperative
 MARL", NeurIPS 2022, and the README of marl-eval 0.0.4.
@@ -30,7 +30,7 @@ def document(
     the environment `steps` at which the metrics were taken.
 
     Metrics that not all rows have are left out: the tool wants the same everywhere. Raises
-    UserError where a run has no final row, or a task's runs were not looked at equally often.
+    UserError where a run has no final row, or a task's runs were not evaluated equally often.
     """
     curves, final = list(curves), list(final)
     metrics = [k for k in final[0] if k not in NAMES] if final else []

@@ -1,4 +1,4 @@
-"""A run: one directory that says what it is and holds all that is needed to go on with it.
+"""A run: one directory that says what it is and holds all that is needed to resume it.
 
 run.json        task, algorithm, schedule, seed, versions: enough to repeat it
 log.jsonl       one line an iteration
@@ -103,7 +103,7 @@ class Run:
             raise UserError(f"out: {directory} cannot be made ({error.strerror}).") from None
         if not force:
             raise UserError(
-                f"out: {directory} already exists; choose another directory, go on with it by "
+                f"out: {directory} already exists; choose another directory, resume it with "
                 f"--resume {directory}, or overwrite it with --force."
             )
         if not (directory / "run.json").is_file():

@@ -53,7 +53,7 @@ DTYPES |= {f"uint{bits}": f"U{bits}" for bits in (8, 16, 32, 64)}
 SESSION = secrets.token_hex(4)  # tells this process from a dead one that had the same number
 SCRATCH = re.compile(r"\.(.+)\.(\d{1,9})-([0-9a-f]{8})-[0-9a-f]{8}\.(tmp|old)")
 ANOTHER, UNTRUSTED = "use another copy of this directory", "do not trust where it came from"
-MENDS = {
+REMEDIES = {
     "free some disk space or choose another disk": (errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
     "choose a directory you may write in": (errno.EACCES, errno.EPERM, errno.EROFS),
     "make sure that its parent is a directory": (errno.ENOENT, errno.ENOTDIR),
@@ -112,14 +112,14 @@ def expect(arrays: Mapping[str, Any], like: Mapping[str, Any], source: str) -> N
 
     Both may hold anything with a `dtype` and a `shape`, as `jax.ShapeDtypeStruct` has.
     """
-    mend = "check that the config is the one it was made with"
+    remedy = "check that the config is the one it was made with"
     for key in sorted({*arrays, *like}):
         if key not in arrays or key not in like:
             what = "unexpected" if key in arrays else "missing"
-            raise UserError(f"{source}: array {key!r} is {what}; {mend}.")
+            raise UserError(f"{source}: array {key!r} is {what}; {remedy}.")
         found, wanted = (f"{np.dtype(x.dtype)}{[*x.shape]}" for x in (arrays[key], like[key]))
         if found != wanted:
-            raise UserError(f"{source}: array {key!r} is {found}, not {wanted}; {mend}.")
+            raise UserError(f"{source}: array {key!r} is {found}, not {wanted}; {remedy}.")
 
 
 def hash_arrays(arrays: Arrays) -> str:
@@ -346,7 +346,11 @@ def versions() -> dict[str, str]:
 
 def _read_at(handle: int, directory: Path, kind: str) -> tuple[dict[str, np.ndarray], dict]:
     for name in sorted({PAYLOAD, MANIFEST} ^ {*os.listdir(handle)}):
-        fault = f"is missing; {ANOTHER}" if name in (PAYLOAD, MANIFEST) else "is alien; remove it"
+        fault = (
+            f"is missing; {ANOTHER}"
+            if name in (PAYLOAD, MANIFEST)
+            else "does not belong there; use another copy"
+        )
         raise CorruptError(f"{directory / name} {fault}.")
     raw = _content(directory / MANIFEST, JSON_LIMIT, handle).tobytes()
     manifest = _read_manifest(raw, directory / MANIFEST, kind)
@@ -426,7 +430,9 @@ def _json(raw: bytes, path: Path | str) -> Any:
     try:
         return _parse(raw)
     except ValueError as error:
-        raise CorruptError(f"{path} is not sound JSON ({error}); mend it or use a copy.") from None
+        raise CorruptError(
+            f"{path} is not sound JSON ({error}); correct it or use a copy."
+        ) from None
 
 
 def _parse(raw: bytes) -> Any:
@@ -518,8 +524,10 @@ def _explained(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        mend = next((m for m, numbers in MENDS.items() if error.errno in numbers), "check the disk")
-        raise UserError(f"{path} could not be written ({error.strerror}); {mend}.") from error
+        remedy = next(
+            (m for m, numbers in REMEDIES.items() if error.errno in numbers), "check the disk"
+        )
+        raise UserError(f"{path} could not be written ({error.strerror}); {remedy}.") from error
 
 
 def _replace(scratch: Path, path: Path) -> None:
@@ -551,7 +559,7 @@ def _check_free(directory: Path, replace: bool) -> None:
     if not replace:
         raise UserError(f"{directory} already exists; remove it or choose another name.")
     if directory.is_symlink() or {*os.listdir(directory)} - {PAYLOAD, MANIFEST}:
-        raise UserError(f"{directory} holds alien files; move it away or choose another name.")
+        raise UserError(f"{directory} holds other files; move it away or choose another name.")
 
 
 def _install(scratch: Path, directory: Path) -> None:

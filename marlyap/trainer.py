@@ -68,7 +68,7 @@ class Carry(eqx.Module):
     memory: Replay
     key: Key
     iteration: Int[Array, ""]
-    best: Policy  # of those looked at, the one with the highest score
+    best: Policy  # of those evaluated, the one with the highest score
     score: Scalar
 
 

@@ -160,7 +160,7 @@ GUARDS = [
     Guard(
         "20 not finite: found and named",
         FIT,
-        (("    for name in FROM_TASK:\n        if line", "    for name in ():\n        if line"),),
+        (("    for name in BY_TASK:\n        if line", "    for name in ():\n        if line"),),
         "tests/test_resume.py::test_the_agent_and_the_step_of_a_bad_reward_are_named",
     ),
     Guard(

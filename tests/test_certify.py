@@ -47,7 +47,7 @@ def certified(run):
 
 @pytest.fixture
 def page(run, certified):
-    return film.certificates(run)
+    return film.certificates(run, run.game, "")
 
 
 def said(capsys, *words):
@@ -101,7 +101,7 @@ def test_a_certificate_of_another_policy_is_not_shown(run, certified, tmp_path):
     carry = other.load()[0]
     bias = lambda c: c.best.pi.net.layers[-1].bias
     other.save(eqx.tree_at(bias, carry, bias(carry) + 0.5), 0.0)
-    assert film.certificates(other)["certificates"] == []
+    assert film.certificates(other, other.game, "")["certificates"] == []
 
 
 def test_bad_certificates_are_one_sentence(run, certified, tmp_path, capsys):

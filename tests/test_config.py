@@ -325,7 +325,7 @@ def run(tmp_path_factory):
     return Run.create(place, Trainer(GAME, RULE, schedule), 0, {"task": "rendezvous"})
 
 
-@settings(max_examples=200, deadline=None, database=None)
+@settings(max_examples=60, deadline=None, database=None)  # each may compile a training
 @given(data=st.data(), value=VALUES)
 def test_a_run_that_others_edited_opens_or_is_refused(run, data, value):
     """Any value anywhere in run.json; then the log, with any line in it."""

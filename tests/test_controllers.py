@@ -6,13 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from marlyap.config import load_controller
 from marlyap.controllers import (
     CONTROLLERS,
     AbstractController,
     OptimalControl,
     PointOffset,
     Replayed,
-    load,
     names_a_controller,
 )
 from marlyap.dynamics import DoubleIntegrator, LateUnicycle, Unicycle
@@ -197,9 +197,9 @@ def test_a_controller_in_a_file_is_loaded_and_drives_any_dynamics(tmp_path):
     game = Rendezvous(dynamics=DoubleIntegrator(), leaders=(0, 1, 2), horizon=60)
     assert names_a_controller(f"{file}:PD") and names_a_controller("zero")
     assert not names_a_controller("runs/demo") and not names_a_controller(str(file))
-    law = load(f"{file}:PD", game)
+    law = load_controller(f"{file}:PD", game)
     assert isinstance(law, AbstractController) and evaluate(game, law, 20).successes.all()
-    assert type(load("tree-pursuit", PATH)) is CONTROLLERS["tree-pursuit"]
+    assert type(load_controller("tree-pursuit", PATH)) is CONTROLLERS["tree-pursuit"]
 
 
 @pytest.mark.parametrize(
@@ -220,16 +220,16 @@ def test_a_controller_that_cannot_be_loaded_is_named(tmp_path, name, says):
     (tmp_path / "broken.py").write_text("1 / 0")
     word = str(tmp_path / name) if ".py" in name else name
     with pytest.raises(UserError, match=f"^controller: .*{says}"):
-        load(word, PATH)
+        load_controller(word, PATH)
 
 
 @pytest.mark.parametrize("dynamics", [DoubleIntegrator(), Unicycle()], ids=["integrator", "uni"])
 def test_zero_and_uniform_actions(dynamics):
     game = Rendezvous(dynamics=dynamics)
     state = game.reset(KEY)
-    assert not np.any(act(load("zero", game), state))
+    assert not np.any(act(load_controller("zero", game), state))
     keys = jax.random.split(KEY, 500)
-    drawn = jax.vmap(lambda k: load("uniform", game)(state, k))(keys)
+    drawn = jax.vmap(lambda k: load_controller("uniform", game)(state, k))(keys)
     assert drawn.shape == (500, 3, 2) and np.abs(drawn).max() <= 1
     np.testing.assert_allclose(np.mean(drawn, axis=0), 0, atol=0.15)
     np.testing.assert_allclose(np.var(drawn, axis=0), 1 / 3, atol=0.08)

@@ -15,12 +15,15 @@ import marlyap
 # within which imports must not go in circles. A new module needs one line here.
 FLOORS = """
     errors
+    cache
+    progress
     types
     devices
     seeds
     statistics
     store
     identity
+    provenance
     programs
     threefry
     graph
@@ -51,6 +54,8 @@ FLOORS = """
     draw
     config
     run
+    subject
+    groups
     marl_eval
     diagnose
     fit

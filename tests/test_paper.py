@@ -741,7 +741,7 @@ def test_a_constraint_about_some_agents_alone(certificate, batch, drawn):
 
 
 def test_a_constraint_about_agents_that_are_not_there():
-    with pytest.raises(UserError, match="^agents: 3 is out of range; take 0 to 2"):
+    with pytest.raises(UserError, match="agents: 3 is out of range; take 0 to 2"):
         Trainer(TASKS["rendezvous"], MASAC(constraint=Lyapunov(agents=(1, 3))), Schedule())
     with pytest.raises(UserError, match="^agents: .* names an agent twice"):
         Lyapunov(agents=(1, 1))

@@ -309,7 +309,7 @@ def test_a_missing_file_is_named(stored, name):
 @pytest.mark.parametrize("name", ["notes.txt", "policy.pkl", ".hidden"])
 def test_an_alien_file_is_named(stored, name):
     (stored / name).write_text("x")
-    assert f"{name} is alien" in refused(stored)
+    assert f"{name} does not belong there" in refused(stored)
 
 
 @pytest.mark.parametrize("name", [PAYLOAD, MANIFEST])

@@ -14,6 +14,9 @@ import pytest
 from marlyap.cli import main
 
 
+SMALL = """--task.horizon 4 --steps 16 --schedule.environments 2 --schedule.steps_per_update 4
+--schedule.warmup 8 --schedule.capacity 40 --schedule.judge_episodes 2
+--algorithm.actor_width 4 --algorithm.critic_width 4 --algorithm.batch 4"""
 RUN, CERTIFICATE = "RUN", "CERTIFICATE"  # replaced by a small trained run and its certificate
 
 TASKS = {  # broken tasks of one's own, by what is wrong with them
@@ -273,20 +276,14 @@ CASES = [
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
+def place(tmp_path_factory, quick_compilation):
     """A directory with a small run, its certificate, and all that can be wrong."""
     import os
 
     root = tmp_path_factory.mktemp("wrong")
     before = os.getcwd()
     os.chdir(root)
-    small = (
-        "--schedule.environments 4 --schedule.warmup 160 --schedule.judge_episodes 8 "
-        "--algorithm.actor_width 8 --algorithm.critic_width 8 --algorithm.batch 16"
-    )
-    assert (
-        main(["train", "rendezvous", "masac", "--steps", "320", "--out", "r", *small.split()]) == 0
-    )
+    assert main(["train", "rendezvous", "masac", "--out", "r", *SMALL.split()]) == 0
     run = root / "r" / "seed0"
     words = "certify r/seed0 --certificates reach --rollouts 800 --out certificate"
     assert main(words.split()) == 0

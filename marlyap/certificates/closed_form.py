@@ -22,7 +22,7 @@ def claim(offset: float, rate: float, level: float, sampled: float) -> str:
         f"in continuous time every point z_i = p_i + {offset:g} h_i converges to the goal at the "
         f"rate {rate:.3g} /s from every state with V <= {level:.3g}, V the sum of the quadratic "
         "forms of all modes, where no input saturates; of the game's own steps only the linear "
-        f"part was looked at (spectral radius {sampled:.4f})"
+        f"part was examined (spectral radius {sampled:.4f})"
     )
 
 

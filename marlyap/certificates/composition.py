@@ -50,7 +50,7 @@ class Composition(AbstractCertificate):
     rollouts: int = 5_000
     calibration: int = 3_000
     T: int = 10  # steps
-    stay: int = 40  # steps past the horizon that are looked at
+    stay: int = 40  # steps past the horizon that are judged
     weights: tuple[float, ...] = (0.01, 0.03, 0.1, 0.3, 1.0)  # price of a gain against delta (m)
     slack: float = 0.2  # relative, on delta
     within: float | None = None  # the largest ultimate bound that is worth claiming (m); the radius

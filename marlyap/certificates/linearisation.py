@@ -66,7 +66,7 @@ class Linearisation(AbstractCertificate):
     every number is clearly 0 or clearly not, else observed.
     """
 
-    scenes: int = 8  # episodes whose target is looked at
+    scenes: int = 8  # episodes whose targets are examined
     margin: float = 1e-3  # of the spectral radius, below 1
     decay: float = 1e-9  # |lambda| >= 1 - decay counts as 1
     confidence: float = 1.0
