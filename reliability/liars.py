@@ -625,7 +625,7 @@ def _(n):
     game = Rendezvous(agents=1, size=0.01)
     found = evaluate(game, lambda state, key: jnp.array([[0.0, 1.0]]), 50, beyond=0)
     says = f"{found.success_rate:.0%} success: {found.rests()}"
-    return Answer("circles inside the ball" not in says, says)
+    return Answer("turns on the spot" not in says, says)
 
 
 @case("certify", "another policy than the one declared")

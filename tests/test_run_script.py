@@ -195,7 +195,7 @@ def test_tests_run_from_any_folder(checkout, tmp_path):
     assert lines[-2] == f"<{tree}/tests>"
     assert lines[-1] == str(tmp_path / "home" / ".cache" / "marlyap" / "jax")
     lines = call(checkout, "test", "test_mine.py::test_a", cwd=tmp_path).stdout.splitlines()
-    assert lines[-4:-1] == ["<-n>", "<2>", "<test_mine.py::test_a>"]
+    assert lines[-6:-1] == ["<-n>", "<2>", "<--dist>", "<loadfile>", "<test_mine.py::test_a>"]
 
 
 def test_check_stops_at_the_first_failure(checkout):
