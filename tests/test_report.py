@@ -528,3 +528,14 @@ def test_long_film_keeps_the_gif_short(tmp_path):
     draw.film_gif(rollout(2, steps=400), tmp_path / "long.gif")
     with opened(tmp_path / "long.gif") as picture:
         assert picture.n_frames <= 121
+
+
+def test_every_rule_of_the_style_sheet_is_one():
+    """Each selector begins where a selector can begin, and the large figure has its rule."""
+    from importlib.resources import files
+
+    page = files("marlyap").joinpath("report_page.html").read_text(encoding="utf-8")
+    style = page[page.index("<style>") + 7 : page.index("</style>")]
+    selectors = re.findall(r"(?:^|[}\n])\s*([^{}@\n]+?)\s*\{", style)
+    assert ".figure" in selectors and ".slices" in selectors
+    assert [s for s in selectors if re.search(r"\.\.|[.#]\s|[.#]$", s)] == []
