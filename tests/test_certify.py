@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from marlyap import film
+from marlyap import film, store
 from marlyap.algorithms import MASAC
 from marlyap.cli import main
 from marlyap.constraints import Lyapunov
@@ -146,3 +146,14 @@ def test_nothing_is_silently_absent(run, tmp_path, capsys):
     assert lines[0].endswith("Asked 98 %, shown 0.00 % (confidence 98.00 %): not reached.")
     assert "[left out] contraction: 20 steps do not fit into an episode of 12" in out
     assert lines[-1] == "Information: each agent acts on its own observation."
+
+
+def test_the_task_that_was_asked_is_the_one_certified(run, tmp_path, capsys):
+    """Fields of --task change what is certified, and such a certificate is not put into the run."""
+    words = ["--task.radius", "0.7", "--certificates", "reach", "--rollouts", "800"]
+    code, _, line = said(capsys, "certify", run.directory, *words)
+    assert code == 2 and line.startswith("marlyap: out: this certificate is not about the task")
+    place = tmp_path / "asked"
+    assert said(capsys, "certify", run.directory, *words, "--out", place)[0] == 0
+    _, meta = store.read(place, "certificate")
+    assert meta["game"]["radius"] == 0.7 and meta["verdicts"]["reach"]["scope"]["radius"] == 0.7

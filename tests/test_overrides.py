@@ -4,6 +4,8 @@
 the package is compared with a plain loop over the game's own methods.
 """
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,9 +13,17 @@ import numpy as np
 import pytest
 
 from marlyap.algorithms import MASAC
+from marlyap.certificates.basin import Basin
+from marlyap.certificates.closed_form import ClosedForm
+from marlyap.certificates.composition import _Windows
+from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
+from marlyap.certificates.linearisation import Linearisation
+from marlyap.certificates.proof import Proof
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
+from marlyap.certificates.safety import Apart, Safe
+from marlyap.certify import certify, save
 from marlyap.dynamics import SingleIntegrator
 from marlyap.errors import UserError
 from marlyap.evaluation import evaluate, outcomes
@@ -21,6 +31,7 @@ from marlyap.film import strip
 from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import AbstractLyapunov, CostSum
 from marlyap.perturb import Perturbed
+from marlyap.recheck import recheck
 from marlyap.rollout import Decentralised, rollout
 from marlyap.seeds import stream
 from marlyap.tasks import Rendezvous
@@ -92,6 +103,7 @@ class ToGoal(eqx.Module):
 
 
 GAME, LAW = Own(), ToGoal()
+PROOF = Proof(c=1.0, rho=0.1, inner=0.1, half=(1.0, 1.0, 1.0, 1.0), most=64)
 KEYS = jax.random.split(stream(0, "evaluate"), 24)
 
 
@@ -270,3 +282,42 @@ def test_certificates_judge_what_the_game_says(oracle):
     final = judged(Quantiles(), Rising()).figures["final_distance"]
     assert np.allclose(final, [s["distance"][H] for s in oracle], atol=1e-5)
     assert CostSum(LAW).value(GAME, jax.tree.map(lambda x: x[0], start)) > 0
+    safe = judged(Safe(stay=H))
+    assert np.array_equal(safe.holds, ~np.array([s["violated"].any() for s in oracle]))
+    basin = judged(Basin(stay=H), Rising())
+    assert np.array_equal(basin.holds, success[:, H:].all(1))
+    value = [np.sum(np.asarray(GAME.distance(jax.tree.map(lambda x: x[0], start))))]
+    assert np.asarray(basin.figures["V"])[0] == pytest.approx(value[0], rel=1e-5)
+    places = np.stack([s["positions"] for s in oracle])
+    gaps = np.linalg.norm(places[:, :, :, None] - places[:, :, None], axis=-1)
+    gaps[:, :, np.arange(3), np.arange(3)] = np.inf
+    apart = judged(Apart(stay=H)).figures["gap"]
+    assert np.allclose(apart, gaps.min(axis=(1, 2, 3)), atol=1e-5)
+    cost = np.stack([s["cost"] for s in oracle])
+    over = judged(Contraction(T=2), steps=H + 1).figures
+    falls = 1 - cost[:, 2 : H + 1] / cost[:, : H - 1]
+    falls = np.where(cost[:, : H - 1] >= GAME.radius, falls, np.inf).min(axis=1)
+    assert np.allclose(over["beta"], np.minimum(falls, 1.0), atol=1e-4)
+    farthest = np.stack([s["distance"] for s in oracle])
+    windows = np.asarray(judged(SimpleNamespace(judge=_Windows(2))).figures["V"]).max(axis=2)
+    assert np.allclose(windows, np.maximum(farthest[:, :-1], farthest[:, 1:]), atol=1e-5)
+
+
+@pytest.mark.parametrize("certificate", (ClosedForm(), PROOF), ids=("closed-form", "proof"))
+def test_formulas_refuse_a_game_with_methods_of_its_own(certificate):
+    with pytest.raises(UserError):
+        certificate.check(GAME, LAW, Rising(), 0)
+
+
+def test_the_linearisation_is_that_of_the_games_own_step():
+    """x+ = 0.95 (x + dt a) with a = 1.5 (goal - x): the target is no equilibrium of that."""
+    verdict = Linearisation().check(GAME, LAW, Rising(), 0)
+    assert not verdict.holds and "no equilibrium" in verdict.claim
+
+
+def test_recheck_refuses_a_game_of_ones_own(tmp_path):
+    table = {"reach": Reach(rollouts=100, share=0.1)}
+    result = certify(GAME, LAW, table, 0, 0.9)
+    save(tmp_path / "certificate", result, GAME, LAW)
+    with pytest.raises(UserError, match="recheck"):
+        recheck(tmp_path / "certificate")
