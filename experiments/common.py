@@ -377,7 +377,8 @@ def forest(args: argparse.Namespace, name: str) -> None:
         least = min(0.0, *(min(e.low, *e.seeds) for e in cases.values()))
         axes.set(xlim=(least - 0.03, 1.03), ylim=(0.6 - len(order), 0.6), title=measure)
         axes.set_yticks([-k for k in range(len(order))])
-        axes.set_yticklabels(order if axes is panels[0] else [], fontsize=7)
+        first = axes.get_subplotspec().is_first_col()
+        axes.set_yticklabels(order if first else [], fontsize=7)
     save(figure, args.results / f"{name}.png")
 
 
