@@ -51,12 +51,23 @@ def outcome(game: AbstractGame, trajectory: Trajectory) -> Outcome:
         final=jnp.where(sound, jnp.max(game.distance(last)), jnp.nan),
         held=jnp.all(inside[-HELD:]) & sound,
         stayed=jnp.all(success[game.horizon :]) & finite(trajectory),
-        speed=jnp.max(jnp.linalg.norm(jax.vmap(game.dynamics.velocity)(last.x), axis=1)),
+        speed=jnp.max(speeds(game, jax.tree.map(lambda x: x[-2], seen.state), last)),
         spin=jnp.max(jnp.abs(jax.vmap(game.dynamics.turning)(last.x))),
         settled=jnp.where(lasts[-1] & sound, jnp.argmax(lasts) * game.dt, jnp.inf),
         violated=jnp.any(jax.vmap(game.violations)(seen.state)),
         total=jnp.sum(jnp.mean(seen.reward, axis=1)),
     )
+
+
+def speeds(game: AbstractGame, before: State, now: State) -> Float[Array, "agent"]:
+    """How fast each agent moves (m/s): what its state says, or how far the last step took it.
+
+    The larger of the two, for a state need not hold the velocity (a point driven by it), and a task
+    may move its agents otherwise than their dynamics would.
+    """
+    told = jnp.linalg.norm(jax.vmap(game.dynamics.velocity)(now.x), axis=1)
+    went = jnp.linalg.norm(game.positions(now) - game.positions(before), axis=1) / game.dt
+    return jnp.maximum(told, went)
 
 
 def episode(game: AbstractGame, controller: Controller, key: Key, beyond: int = 0) -> Trajectory:

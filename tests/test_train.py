@@ -11,11 +11,13 @@ import pytest
 from conftest import same
 from jaxtyping import Array
 
+from marlyap.dynamics import SingleIntegrator
 from marlyap.errors import UserError
 from marlyap.evaluation import compare, episode, evaluate, pooled
 from marlyap.nets import Greedy, Sampled
 from marlyap.rollout import Decentralised
 from marlyap.seeds import stream
+from marlyap.tasks import Rendezvous
 from marlyap.trainer import Schedule, Trainer, shape
 
 
@@ -280,7 +282,7 @@ def test_outcomes_are_those_of_the_trajectories(wide):
     spin = np.abs(e.state.x[:, -1, :, 4]).max(1)
     np.testing.assert_allclose(got.spin, spin, atol=1e-6)
     np.testing.assert_array_equal(got.at_rest, got.successes & (got.speed <= 0.1) & (spin <= 0.1))
-    np.testing.assert_allclose(got.speed, np.abs(e.state.x[:, -1, :, 3]).max(1), atol=1e-6)
+    np.testing.assert_allclose(got.speed, np.abs(e.state.x[:, -1, :, 3]).max(1), atol=1e-5)
     np.testing.assert_allclose(got.total, e.reward.mean(2).sum(1), rtol=1e-5)
     kinds = set()
     for inside, settled in zip(distance <= wide.radius, got.settled, strict=True):
@@ -296,6 +298,22 @@ def test_outcomes_are_those_of_the_trajectories(wide):
     assert low < summary["success_rate"] < high
     both = pooled([got, got])
     assert both.success_rate == got.success_rate and len(both.final) == 128
+
+
+def test_motion_that_the_state_does_not_hold_is_seen():
+    """A point driven by its velocity circles inside the ball: its state has no velocity in it."""
+    dynamics = SingleIntegrator((1.0, 1.0))
+    point = Rendezvous(agents=1, dynamics=dynamics, size=0.01, radius=0.5, horizon=10)
+    angle = lambda state: state.t / 2.0
+    circle = lambda state, key: (
+        0.4 * jnp.stack([jnp.cos(angle(state)), jnp.sin(angle(state))])[None]
+    )
+    moving, still = (
+        evaluate(point, law, 8, beyond=0) for law in (circle, lambda s, k: jnp.zeros((1, 2)))
+    )
+    assert moving.successes.all() and not moving.at_rest.any() and still.at_rest.all()
+    np.testing.assert_allclose(moving.speed, 0.4, rtol=1e-4)
+    assert "keeps moving" in moving.rests() and still.rests() == "comes to rest"
 
 
 def test_an_episode_that_is_not_finite_has_failed(wide):
