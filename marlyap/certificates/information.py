@@ -1,12 +1,13 @@
 """What a controller uses, found by changing what it should not see and watching its actions."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from marlyap.game import AbstractGame
 from marlyap.rollout import Controller, Decentralised, rollout
@@ -42,7 +43,7 @@ def information(game: AbstractGame, controller: Controller, key: Key) -> str:
     clock = np.flatnonzero(_clock(game, controller, states))
     if len(clock):
         return f"NOT decentralised: agent {clock[0]}'s action changes with the time"
-    for i, j in _pairs(_goals(game, controller, states, k_change)):
+    for i, j in _pairs(_goals(controller, states, k_change)):
         if i != j:
             return f"NOT decentralised: agent {i}'s action changes with the target of agent {j}"
         if i not in game.leaders:
@@ -102,25 +103,37 @@ def _clock(game: AbstractGame, controller: Controller, states: State) -> Bool[Ar
     return jnp.any(jax.vmap(one)(states), axis=0)
 
 
-@eqx.filter_jit
-def _goals(
-    game: AbstractGame, controller: Controller, states: State, key: Key
+def _influence(
+    states: State,
+    key: Key,
+    what: Callable[[State], Float[Array, "agent number"]],
+    affected: Callable[[State, Float[Array, "agent number"], Array], Bool[Array, "agent"]],
 ) -> Bool[Array, "agent agent"]:
-    """[i, j]: agent i's action changes with the goal of agent j, in some state."""
+    """[i, j]: agent i is `affected` by a change of row j of `what` a state holds, in some state.
+
+    `affected(state, changed, j)` says for each agent whether its action differs.
+    """
 
     def one(state: State, key: Key) -> Array:
-        here = _act(controller, state)
-
-        def moved(j: Array, change: Array) -> Array:
-            goal = state.goal.at[j].add(change[j])
-            return _differ(_act(controller, eqx.tree_at(lambda s: s.goal, state, goal)), here)
-
-        changes = _change(key, state.goal)
-        each = lambda j: jnp.any(jax.vmap(lambda c: moved(j, c))(changes), axis=0)
-        return jax.lax.map(each, jnp.arange(game.agents)).T
+        rows = what(state)
+        changes = _change(key, rows)
+        by = lambda j: lambda change: affected(state, rows.at[j].add(change[j]), j)
+        each = lambda j: jnp.any(jax.vmap(by(j))(changes), axis=0)
+        return jax.lax.map(each, jnp.arange(rows.shape[0])).T
 
     keys = jax.random.split(key, states.t.shape[0])
     return jnp.any(jax.vmap(one)(states, keys), axis=0)
+
+
+@eqx.filter_jit
+def _goals(controller: Controller, states: State, key: Key) -> Bool[Array, "agent agent"]:
+    """[i, j]: agent i's action changes with the goal of agent j, in some state."""
+
+    def affected(state: State, goal: Array, j: Array) -> Array:
+        other = eqx.tree_at(lambda s: s.goal, state, goal)
+        return _differ(_act(controller, other), _act(controller, state))
+
+    return _influence(states, key, lambda s: s.goal, affected)
 
 
 @eqx.filter_jit
@@ -129,38 +142,19 @@ def _strangers(
 ) -> Bool[Array, "agent agent"]:
     """[i, j]: agent i's action changes with the state of agent j, to which it is not linked."""
 
-    def one(state: State, key: Key) -> Array:
-        here, linked = _act(controller, state), game.linked(state)
+    def affected(state: State, x: Array, j: Array) -> Array:
+        other, linked = eqx.tree_at(lambda s: s.x, state, x), game.linked(state)
+        alike = jnp.all(game.linked(other) == linked, axis=1)  # a disk may link others now
+        stranger = ~linked[:, j] & (jnp.arange(game.agents) != j) & alike
+        return _differ(_act(controller, other), _act(controller, state)) & stranger
 
-        def moved(j: Array, change: Array) -> Array:
-            other = eqx.tree_at(lambda s: s.x, state, state.x.at[j].add(change[j]))
-            links = game.linked(other)
-            alike = jnp.all(links == linked, axis=1)  # a disk may link others now
-            stranger = ~linked[:, j] & (jnp.arange(game.agents) != j) & alike
-            return _differ(_act(controller, other), here) & stranger
-
-        changes = _change(key, state.x)
-        each = lambda j: jnp.any(jax.vmap(lambda c: moved(j, c))(changes), axis=0)
-        return jax.lax.map(each, jnp.arange(game.agents)).T
-
-    keys = jax.random.split(key, states.t.shape[0])
-    return jnp.any(jax.vmap(one)(states, keys), axis=0)
+    return _influence(states, key, lambda s: s.x, affected)
 
 
 @eqx.filter_jit
 def _rows(controller: Decentralised, states: State, key: Key) -> Bool[Array, "agent agent"]:
     """[i, j]: row i of a policy's action changes with row j of the observations."""
-
-    def one(state: State, key: Key) -> Array:
-        obs = controller.game.observations(state)
-        here = controller.policy(obs, jax.random.key(0))
-
-        def moved(j: Array, change: Array) -> Array:
-            return _differ(controller.policy(obs.at[j].add(change[j]), jax.random.key(0)), here)
-
-        changes = _change(key, obs)
-        each = lambda j: jnp.any(jax.vmap(lambda c: moved(j, c))(changes), axis=0)
-        return jax.lax.map(each, jnp.arange(obs.shape[0])).T
-
-    keys = jax.random.split(key, states.t.shape[0])
-    return jnp.any(jax.vmap(one)(states, keys), axis=0)
+    act = lambda obs: controller.policy(obs, jax.random.key(0))
+    see = controller.game.observations
+    affected = lambda state, obs, j: _differ(act(obs), act(see(state)))
+    return _influence(states, key, see, affected)
