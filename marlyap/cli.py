@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -334,8 +335,14 @@ def on_interrupt_exit() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def exit_interrupted(*_: object) -> NoReturn:
-    """One line and exit code 130, now."""
+ENDING = threading.Lock()
+
+
+def exit_interrupted(*_: object) -> None:
+    """One line and exit code 130, now. The first of the two threads that are told does it."""
+    if not ENDING.acquire(blocking=False):
+        time.sleep(1.0)  # the other one ends the process meanwhile
+        return
     flush = threading.Thread(target=sys.stdout.flush, daemon=True)
     flush.start()
     flush.join(0.5)  # a full pipe must not keep us

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -24,12 +25,24 @@ def run(tmp_path_factory):
     return out / "seed0"
 
 
+WATCHED = """
+from marlyap import cli
+watch = cli.on_interrupt_exit
+cli.on_interrupt_exit = lambda: (watch(), print("ready", flush=True))
+cli.program()
+"""
+
+
 def interrupted(argv, seconds):
-    """Exit code and standard error of a command that is sent SIGINT after so many seconds."""
-    command = [sys.executable, "-m", "marlyap", *map(str, argv)]
+    """Exit code and standard error of a command sent SIGINT so many seconds after it begins.
+
+    It begins when its handler stands: how long Python takes to start is the machine's affair.
+    """
+    command = [sys.executable, "-c", WATCHED, *map(str, argv)]
     with subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as child:
+        assert child.stdout is not None and child.stdout.readline() == "ready\n"
         time.sleep(seconds)
         child.send_signal(signal.SIGINT)
         sent = time.monotonic()
@@ -80,7 +93,19 @@ def test_an_interrupt_at_any_moment_is_one_line(run, tmp_path, verb, seconds):
 @pytest.mark.slow
 @pytest.mark.parametrize("verb", ["watch", "list", "demo", "train"])
 def test_every_verb_ends_in_one_line(run, tmp_path, verb):
-    ends_in_one_line(verbs(run, tmp_path)[verb], 0.5)
+    ends_in_one_line(verbs(run, tmp_path)[verb], 0.1)
+
+
+def test_two_threads_that_are_told_say_it_once(capfd, monkeypatch):
+    """Python's handler and the watching thread can both be told of one signal."""
+    monkeypatch.setattr(cli, "ENDING", threading.Lock())
+    monkeypatch.setattr(os, "_exit", lambda code: None)
+    both = [threading.Thread(target=cli.exit_interrupted) for _ in range(2)]
+    for thread in both:
+        thread.start()
+    for thread in both:
+        thread.join()
+    assert capfd.readouterr().err.count("interrupted") == 1
 
 
 def test_in_process_an_interrupt_is_a_code(monkeypatch, capfd):
