@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
-from marlyap.nets import LyapunovNet, NormNet
+from marlyap.nets import NormNet
 from marlyap.rollout import Controller, rollout
 from marlyap.sensing import near
 from marlyap.types import Scalar, State, Trajectory
@@ -162,31 +162,6 @@ class Norm(AbstractLyapunov):
 
     def value(self, game, state):
         return self.net(game.features(state))
-
-    def along(self, game, trajectory, time):
-        return pointwise(self, game, trajectory, time)
-
-
-class ActionValue(AbstractLyapunov):
-    """V(s) = L(s, mu(s)) of a trained `LyapunovNet` and a deterministic controller mu.
-
-    Nothing makes it zero on the target set; `require_zero` decides whether it may be used.
-    """
-
-    net: LyapunovNet
-    controller: Controller
-    ball: float = 0.0
-
-    @property
-    def meaning(self):
-        return "the learnt L(s, mu(s))"
-
-    @property
-    def beyond(self):
-        return 0
-
-    def value(self, game, state):
-        return self.net(game.features(state), self.controller(state, jax.random.key(0)))
 
     def along(self, game, trajectory, time):
         return pointwise(self, game, trajectory, time)
