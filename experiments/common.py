@@ -50,7 +50,7 @@ from marlyap.seeds import stream
 from marlyap.store import write_text_atomic
 from marlyap.tasks import TASKS
 from marlyap.trainer import SCHEDULES, Schedule, Trainer
-from marlyap.workers import train_all
+from marlyap.runs.launch import train_all
 
 
 Row = dict[str, Any]

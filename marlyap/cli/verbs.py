@@ -40,7 +40,7 @@ from marlyap.sensing import Entry
 from marlyap.subject import asked, refuse_all_but_task, subject, supplies
 from marlyap.tasks import TASKS
 from marlyap.trainer import SCHEDULES, Trainer, schedule_for
-from marlyap.workers import train_all
+from marlyap.runs.launch import train_all
 
 
 Result = tuple[dict[str, Any] | None, int]

@@ -292,9 +292,9 @@ def command(argv: list[str]) -> int:
     prepare(args)
     if getattr(args, "device", None):
         find_device(args.device)
-    from marlyap import commands
+    from marlyap.cli import verbs
 
-    result, code = commands.VERBS[args.verb](args, overrides)
+    result, code = verbs.VERBS[args.verb](args, overrides)
     if args.json and result is not None:
         print(json.dumps(result))
     return code
