@@ -5,6 +5,7 @@ import importlib
 import io
 import json
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -588,6 +589,34 @@ def test_list_prints_one_object(capsys):
     assert all(len(text) > 10 and "\n" not in text for f in found.values() for text in f.values())
     code, out, _ = call(capsys, "list")
     assert code == 0 and all(name in out for family in found.values() for name in family)
+
+
+def test_list_shows_whole_sentences(capsys):
+    found = strict(call(capsys, "list", "--json")[1])
+    del found["presets"]
+    for family in found.values():
+        for text in family.values():
+            assert re.fullmatch(r"[A-Z{].*\.( \(.*\))?", text), text
+
+
+LAW = """
+from marlyap.controllers import Zero
+from marlyap.game import AbstractGame
+
+class Push(Zero):
+    game: AbstractGame
+    gain: float = 0.5  # inputs for each metre
+"""
+
+
+def test_list_shows_the_gains_of_a_controller_of_ones_own(tmp_path, capsys):
+    (tmp_path / "law.py").write_text(LAW)
+    code, out, _ = call(capsys, "list", "law.py:Push", "--json")
+    assert code == 0 and strict(out) == {
+        "gain": {"value": "0.5", "meaning": "inputs for each metre"}
+    }
+    parts = ["law.py defines no task, algorithm or controller called 'Pull'"]
+    refused(capsys, "list", "law.py:Pull", parts=parts)
 
 
 def test_list_of_one_prints_one_object(capsys):

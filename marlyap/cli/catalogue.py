@@ -1,6 +1,7 @@
 """What `marlyap list` shows: names with a sentence each, and the fields of one."""
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
@@ -13,7 +14,7 @@ from marlyap import config
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.algorithms import ALGORITHMS, PRESETS
 from marlyap.certificates import CERTIFICATES
-from marlyap.controllers import CONTROLLERS
+from marlyap.controllers import CONTROLLERS, AbstractController
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
 from marlyap.sensing import Entry
@@ -56,9 +57,10 @@ def show_all(quiet: bool) -> dict[str, Any]:
 
 
 def summary(thing: Any) -> str:
-    """The first line of its documentation."""
+    """The first sentence of its documentation, and what sets it apart from others of its class."""
     cls = thing if isinstance(thing, type) else type(thing)
-    line = (cls.__doc__ or "").strip().splitlines()[0]
+    first = (cls.__doc__ or "").strip().partition("\n\n")[0]
+    line = re.split(r"(?<=\.) (?=[A-Z])", " ".join(first.split()))[0]
     if isinstance(thing, AbstractGame):
         n, who = thing.agents, len(thing.leaders)
         limits = " and ".join(f"{u:g}" for u in thing.dynamics.limits)
@@ -123,16 +125,28 @@ def rows_of(name: str) -> list[tuple[str, str, str]]:
     if name in ("schedule", *PRESETS):
         return dotted(SCHEDULES["tuned" if name == "schedule" else name], "schedule")
     if name in CONTROLLERS:
-        return config.describe_class(CONTROLLERS[name]) or [("(no gains)", "", "")]
+        return gains_of(CONTROLLERS[name])
     if name in CERTIFICATES:
         return [(o.lstrip("."), v, m) for o, v, m in config.describe(CERTIFICATES[name], "")]
     if ":" not in name and not name.endswith(".py"):
         there = [*TASKS, *ALGORITHMS, *CONTROLLERS, *CERTIFICATES, *PRESETS, "schedule"]
         raise UserError(f"name: nothing is called '{name}'; {config.suggest(name, there)}")
-    game = game_called(name)
-    if game is not None:
+    if (game := game_called(name)) is not None:
         return dotted(game, "task")
-    return dotted(config.load(name, AbstractAlgorithm), "algorithm")
+    with suppress(config.NotOfThatKind):
+        return dotted(config.load(name, AbstractAlgorithm), "algorithm")
+    with suppress(config.NotOfThatKind):
+        return gains_of(config.controller_class(name))
+    path, _, attribute = name.rpartition(":")
+    raise UserError(
+        f"name: {path} defines no task, algorithm or controller called '{attribute}'; write its "
+        "class there."
+    )
+
+
+def gains_of(cls: type[AbstractController]) -> list[tuple[str, str, str]]:
+    """(field, value, meaning) of a controller."""
+    return config.describe_class(cls) or [("(no gains)", "", "")]
 
 
 def game_called(name: str) -> AbstractGame | None:
