@@ -101,14 +101,15 @@ def test_code_is_found_by_the_file_of_its_class_or_refused(tmp_path):
     places = {}
     for cls in (Rendezvous, Here, Local):
         run = Run.create(tmp_path / cls.__name__, Trainer(cls(), TINY, PLAN), 0, {})
-        places[cls] = lambda how=Launch(), run=run: launching._with_code(run, how).task
-    assert places[Rendezvous]() is None
-    assert places[Here]() == f"{__file__}:Here"
+        places[cls] = run
+    found = lambda cls, how: launching._with_code(places[cls], how).task
+    assert found(Rendezvous, Launch()) is None
+    assert found(Here, Launch()) == f"{__file__}:Here"
     (tmp_path / "own.py").write_text("")
     named = f"{tmp_path}/own.py:Local"
-    assert places[Local](Launch(task=named)) == named
+    assert found(Local, Launch(task=named)) == named
     with pytest.raises(UserError, match=r"task: Local is code of your own.*take parallel='vmap'"):
-        places[Local]()
+        found(Local, Launch())
 
 
 def test_the_second_request_to_stop_ends_at_once(monkeypatch):
