@@ -85,11 +85,10 @@ class _Child:
     """A run in a process of its own, and a thread that puts its answers into a queue."""
 
     def __init__(self, run: Run, core: int, how: Launch, queue: Queue):
-        job = Job(str(run.directory), core, _with_code(run, how))
         self.run, self.core, self.errors = run, core, tempfile.TemporaryFile("w+")
         self.failed: list[str] = []
         self.process = _spawn(self.errors)
-        self.say(job.to_json())
+        self.say(Job(str(run.directory), core, how).to_json())
         threading.Thread(target=self._listen, args=(queue,), daemon=True).start()
 
     def say(self, line: str) -> None:
@@ -100,18 +99,18 @@ class _Child:
 
     def _listen(self, queue: Queue) -> None:
         assert self.process.stdout is not None
-        for line in self.process.stdout:
-            with suppress(ValueError):  # cut short by a kill
-                queue.put((self, events.from_json(line)))
+        with self.process.stdout as answers:
+            for line in answers:
+                with suppress(ValueError):  # cut short by a kill
+                    queue.put((self, events.from_json(line)))
         queue.put((self, None))
 
     def end(self, stopped: bool) -> str | None:
         """Why the run failed, once its process has ended; None if it did not."""
         code = self.process.wait()
-        for pipe in (self.process.stdin, self.process.stdout):
-            if pipe is not None:
-                with suppress(OSError):
-                    pipe.close()
+        assert self.process.stdin is not None
+        with suppress(OSError):  # what it never read is still in the buffer
+            self.process.stdin.close()
         self.errors.seek(0)
         said = self.errors.read().strip().splitlines()
         self.errors.close()
@@ -139,13 +138,14 @@ def _processes(runs: list[Run], how: Launch, stop: Callable[[], bool]) -> Iterat
     """One process a core; the others continue where one fails."""
     free = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
     queue: Queue[tuple[_Child, events.Event | None]] = Queue()
-    waiting, active, asked = list(runs), set[_Child](), False
+    waiting = [(run, _with_code(run, how)) for run in runs]  # before any process is started
+    active, asked = set[_Child](), False
     failed: list[str] = []
     try:
         while active or (waiting and not stop()):
             while waiting and free and not stop():
-                run = waiting.pop(0)
-                active.add(_Child(run, free.pop(0), how, queue))
+                run, own = waiting.pop(0)
+                active.add(_Child(run, free.pop(0), own, queue))
                 yield events.Started(*run.named)
             if stop() and not asked:
                 asked = True
