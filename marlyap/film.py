@@ -17,7 +17,7 @@ from marlyap.errors import UserError
 from marlyap.evaluation import episode, evaluate
 from marlyap.game import AbstractGame
 from marlyap.identity import plain, policy_hash
-from marlyap.lyapunov_function import CostSum, at_target
+from marlyap.lyapunov_function import CostSum
 from marlyap.rollout import Controller, rollout, until
 from marlyap.run import Run
 from marlyap.seeds import Purpose, stream
@@ -106,7 +106,7 @@ def _title(runs: Sequence[Run], found: Sequence[groups.Measured]) -> str:
 
 def _subtitle(found: Sequence[groups.Measured], teams: Sequence[Mapping[str, Any]]) -> str:
     count = lambda n, what: f"{n} {what}{'s' * (n != 1)}"
-    sizes = {(m.game.agents, len(m.game.leaders)) for m in found}
+    sizes = {(m.game.agents, len(m.game.informed)) for m in found}
     parts = [f"{count(a, 'agent')}, {count(b, 'leader')}" for a, b in sizes] * (len(sizes) == 1)
     parts.append(count(len(found), "run"))
     parts += [count(len(teams), "configuration")] * (len(teams) > 1)
@@ -264,7 +264,7 @@ def one(
     seed: int,
     label: str = "",
     episodes: int = 500,
-    game: AbstractGame | None = None,
+    game: Any | None = None,
 ) -> dict[str, Any]:
     """One evaluation episode as a film, with L along it where there is one.
 
@@ -285,29 +285,29 @@ def one(
 
 
 @eqx.filter_jit
-def _episode(game: AbstractGame, controller: Controller, key: Key) -> Trajectory:
+def _episode(game: Any, controller: Controller, key: Key) -> Trajectory:
     """An episode and one step more, whose cost is that of the last state."""
     return episode(game, controller, key, 1)
 
 
 @eqx.filter_jit
-def _lyapunov(game: AbstractGame, controller: Controller, L: Any, path: Trajectory) -> jax.Array:
+def _lyapunov(game: Any, controller: Controller, L: Any, path: Trajectory) -> jax.Array:
     """L(s_t, mu(s_t)) along an episode."""
     value = lambda s: L(game.features(s), controller(s, jax.random.key(0)))
     return jax.vmap(value)(path.state)
 
 
-def strip(game: AbstractGame, path: Trajectory, lyapunov: jax.Array | None) -> dict[str, Any]:
+def strip(game: Any, path: Trajectory, lyapunov: jax.Array | None) -> dict[str, Any]:
     """All but the last state of a trajectory, as the plain values that are drawn."""
     dynamics, state = game.dynamics, jax.tree.map(lambda leaf: leaf[:-1], path.state)
     headings = np.asarray(state.x[:, :, 2]).tolist() if "psi" in dynamics.names else None
     linked = np.asarray(jax.vmap(game.linked)(state))
     distance = np.asarray(jax.vmap(game.distance)(state)).max(axis=1)
     edges = [[[int(i), int(j)] for i, j in np.argwhere(np.triu(a))] for a in linked]
-    cost, goals = np.asarray(path.cost).mean(axis=1), np.asarray(state.goal[0])
+    cost, goals = np.asarray(path.cost).mean(axis=1), np.asarray(state.scenario.goal[0])
     return {
         "dt": game.dt,
-        "radius": game.radius,
+        "radius": game.edge,
         "target": (goals[0] if (goals == goals[0]).all() else goals).tolist(),
         "positions": np.asarray(jax.vmap(game.positions)(state)).tolist(),
         "headings": headings,
@@ -320,7 +320,7 @@ def strip(game: AbstractGame, path: Trajectory, lyapunov: jax.Array | None) -> d
     }
 
 
-def certificates(run: Run, game: AbstractGame, label: str) -> dict[str, list[Any]]:
+def certificates(run: Run, game: Any, label: str) -> dict[str, list[Any]]:
     """What `certify` left beside a run: its claims, its worst cases as films, its V along slices.
 
     A certificate of another policy or another game than these is left out, and a note says so. So
@@ -372,7 +372,7 @@ def certificates(run: Run, game: AbstractGame, label: str) -> dict[str, list[Any
 
 @eqx.filter_jit
 def _replay(
-    game: AbstractGame, controller: Controller, V: CostSum | None, start: State
+    game: Any, controller: Controller, V: CostSum | None, start: State
 ) -> tuple[Trajectory, jax.Array | None]:
     """Two horizons from a start and a step more, and V along the two."""
     beyond = 1 if V is None else max(1, V.beyond)
@@ -381,14 +381,14 @@ def _replay(
     return seen, None if V is None else V.along(game, path, 2 * game.horizon + 1)
 
 
-def _extremes(game: AbstractGame) -> list[int]:
+def _extremes(game: Any) -> list[int]:
     """A leader, and the agent that is farthest from all leaders."""
-    hops = graphs.hops(game.adjacency, game.leaders)
+    hops = graphs.hops(game.adjacency, game.informed)
     return sorted({int(np.argmin(hops)), int(np.argmax(hops))})
 
 
 def slice_of(
-    game: AbstractGame, V: CostSum, agent: int, level: float | None, side: int = 41
+    game: Any, V: CostSum, agent: int, level: float | None, side: int = 41
 ) -> dict[str, Any]:
     """Contours of V where one agent rests beside the goal (m) and all others on it."""
     import contourpy
@@ -402,7 +402,7 @@ def slice_of(
     return {
         "label": f"agent {agent}, {'a leader' if game.leads[agent] else 'a follower'}",
         "reach": reach,
-        "radius": game.radius,
+        "radius": game.edge,
         "headings": "psi" in game.dynamics.names,
         "contours": [
             {
@@ -416,9 +416,9 @@ def slice_of(
 
 
 @eqx.filter_jit
-def _plane(game: AbstractGame, V: CostSum, agent: Any, grid: Any) -> jax.Array:
+def _plane(game: Any, V: CostSum, agent: Any, grid: Any) -> jax.Array:
     """V [y, x] with one agent at (x, y) from its goal, facing along x."""
-    rest = at_target(game, game.reset(jax.random.key(0)))
+    rest = game.at_target(game.reset(jax.random.key(0)))
     if "psi" in game.dynamics.names:
         rest = eqx.tree_at(lambda s: s.x, rest, rest.x.at[:, 2].set(0.0))
 

@@ -62,10 +62,10 @@ def summary(thing: Any) -> str:
     first = (cls.__doc__ or "").strip().partition("\n\n")[0]
     line = re.split(r"(?<=\.) (?=[A-Z])", " ".join(first.split()))[0]
     if isinstance(thing, AbstractGame):
-        n, who = thing.agents, len(thing.leaders)
-        limits = " and ".join(f"{u:g}" for u in thing.dynamics.limits)
-        several = "s" * (who > 1)
-        line += f" ({n} agents, {who} leader{several}, {thing.graph} graph, limits {limits})"
+        n, who = thing.agents, len(thing.informed)
+        limits = " and ".join(f"{u:g}" for u in thing.plant.limits)
+        leaders = f", {who} leader{'s' * (who > 1)}" if who < n else ""
+        line += f" ({n} agents{leaders}, {thing.graph} graph, limits {limits})"
     elif isinstance(thing, AbstractAlgorithm) and (set_here := changes(thing)):
         line += f" ({', '.join(set_here)})"
     return line

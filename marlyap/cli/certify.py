@@ -39,6 +39,7 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     from marlyap.certificate import sentence
     from marlyap.certify import certify, save
     from marlyap.cli import claims
+    from marlyap.game import regulated
     from marlyap.lyapunov_function import cost_sum
     from marlyap.seeds import stream
 
@@ -47,11 +48,12 @@ def run(args: Namespace, overrides: Overrides) -> Result:
         raise UserError(f"out: {out} already exists; choose another or add --force.")
     usual = claims.usual(game)
     chosen = claims.chosen(args.certificates or usual, args.rollouts)
+    game = regulated(game)
     V = cost_sum(game, controller, stream(args.seed, "calibrate"))
-    if V.ball > game.radius:
+    if V.ball > game.edge:
         say(
-            f"V ignores errors below {V.ball:g} m: started on the target, this controller drifts "
-            "that far."
+            f"V ignores errors below {V.ball:g} {V.unit}: started on the target, this controller "
+            "drifts that far."
         )
     tell = say if args.json else print
 
