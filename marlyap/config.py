@@ -28,8 +28,8 @@ from marlyap.controllers import CONTROLLERS, AbstractController
 from marlyap.dynamics import DYNAMICS, AbstractDynamics
 from marlyap.errors import UserError, first_line, raised_at, whole
 from marlyap.game import AbstractGame
+from marlyap.schedule import Schedule
 from marlyap.tasks import TASKS
-from marlyap.trainer import Schedule
 
 
 T = TypeVar("T")

@@ -182,16 +182,16 @@ def learner(masac, shape, batch):
     """Its learner in mid-training: targets lag, norms and temperature have moved; Adam is fresh."""
     import equinox as eqx
 
-    from marlyap.learn import Learnt
+    from marlyap.optimiser import TrainState
 
     l = filled(masac.init, shape, jax.random.key(0))
     number = lambda x: jnp.asarray(x, jnp.float32)
-    fresh = lambda learnt: Learnt.of(learnt.value)
+    fresh = lambda learnt: TrainState.of(learnt.value)
     L = l.L
     L = eqx.tree_at(
         lambda L: (L.net, L.log_weight, L.gradient, L.scale),
         L,
-        (fresh(L.net), Learnt.of(number(np.log(0.3))), number(0.8), number(1.7)),
+        (fresh(L.net), TrainState.of(number(np.log(0.3))), number(0.8), number(1.7)),
     )
     l = eqx.tree_at(lambda l: l.Q_bar, l, level(l.Q_bar, batch.next_features, batch.action))
     return eqx.tree_at(
@@ -199,8 +199,8 @@ def learner(masac, shape, batch):
         l,
         (
             fresh(l.pi),
-            Learnt.of(level(l.Q.value, batch.features, batch.action)),
-            Learnt.of(number(-1.2)),
+            TrainState.of(level(l.Q.value, batch.features, batch.action)),
+            TrainState.of(number(-1.2)),
             L,
         ),
     )

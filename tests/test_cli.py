@@ -486,7 +486,7 @@ def test_nan_from_a_users_task_is_named_and_the_last_checkpoint_is_intact(
     assert saved.step == at - 1 and saved.warnings == ()
     numbers = [x for x in saved.arrays.values() if x.dtype.kind == "f"]
     assert numbers and all(np.isfinite(x).all() for x in numbers)
-    leaves = jax.tree.leaves(opened.handed_out()[0])
+    leaves = jax.tree.leaves(opened.deployed()[0])
     assert all(jnp.isfinite(x).all() for x in leaves if isinstance(x, jax.Array))
 
     before = contents(run)

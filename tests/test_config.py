@@ -141,7 +141,7 @@ def test_what_cannot_be_set_is_said_in_one_sentence(of, path, text, parts):
         (RULE, "alpha", "0"),
         (RULE, "actor_width", "0"),
         (RULE, "critic_width", "-8"),
-        (RULE, "average", "0"),
+        (RULE, "ema_rate", "0"),
         (RULE, "constraint.weight_start", "0"),
         (RULE, "constraint.floor", "0"),
         (RULE, "constraint.discount", "2"),

@@ -22,7 +22,7 @@ class DecentralisedSAC(MASAC):
     """Each agent learns alone, from what it observes, its own action and its own reward.
 
     To each, the game has one agent, and the others are part of the world: it has a critic and a
-    temperature of its own. Its learner has a leading axis `agent`.
+    temperature of its own. Its networks have a leading axis `agent`.
     """
 
     def __check_init__(self):
@@ -37,21 +37,21 @@ class DecentralisedSAC(MASAC):
             jax.random.split(key, shape.agents)
         )
 
-    def update(self, learner, b, decay):
+    def update(self, networks, b, decay):
         """A step of every agent's own learning; the log has the mean over agents."""
         agents = jnp.arange(b.action.shape[1])
 
         def step(l, i):
             return MASAC.update(self, l, jax.vmap(lambda b: alone(b, i))(b), decay)
 
-        learner, info = eqx.filter_vmap(step)(learner, agents)
-        return learner, jax.tree.map(jnp.mean, info)
+        networks, info = eqx.filter_vmap(step)(networks, agents)
+        return networks, jax.tree.map(jnp.mean, info)
 
-    def explore(self, learner):
-        return Sampled(team(learner.pi.value))
+    def explore(self, networks):
+        return Sampled(team(networks.pi.value))
 
-    def exploit(self, learner):
-        return Greedy(team(learner.pi_mean))
+    def policy(self, networks):
+        return Greedy(team(networks.pi_mean))
 
 
 def alone(b: Transition, i: Int[Array, ""]) -> Transition:
@@ -82,19 +82,19 @@ class CentralisedSAC(MASAC):
     def init(self, shape, key):
         return MASAC.init(self, shape._replace(obs=shape.agents * shape.obs), key)
 
-    def update(self, learner, b, decay):
+    def update(self, networks, b, decay):
         """The step of MASAC, where everyone observes everything."""
 
         def widened(b: Transition) -> Transition:
             return dataclasses.replace(b, obs=joint(b.obs), next_obs=joint(b.next_obs))
 
-        return MASAC.update(self, learner, jax.vmap(widened)(b), decay)
+        return MASAC.update(self, networks, jax.vmap(widened)(b), decay)
 
-    def explore(self, learner) -> AbstractExplorer:
-        return JointExplorer(Sampled(learner.pi.value))
+    def explore(self, networks) -> AbstractExplorer:
+        return JointExplorer(Sampled(networks.pi.value))
 
-    def exploit(self, learner) -> Policy:
-        return Joint(Greedy(learner.pi_mean))
+    def policy(self, networks) -> Policy:
+        return Joint(Greedy(networks.pi_mean))
 
 
 def joint(obs: Obs) -> Float[Array, "agent agent*obs"]:

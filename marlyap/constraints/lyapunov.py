@@ -37,6 +37,7 @@ What the condition does not say:
   `norm` it is.
 """
 
+import dataclasses
 from typing import Literal
 
 import equinox as eqx
@@ -46,17 +47,18 @@ from jaxtyping import Array, Float
 
 from marlyap.constraint import AbstractConstraint
 from marlyap.errors import UserError, within
-from marlyap.learn import Learnt, polyak
 from marlyap.nets import LyapunovNet, NormNet, Sample
+from marlyap.optimiser import TrainState, polyak
+from marlyap.source import CostWindow
 from marlyap.types import Action, Scalar, Transition
 
 
-class Certificate(eqx.Module):
+class LearnedLyapunov(eqx.Module):
     """What the constraint has learnt."""
 
-    net: Learnt[LyapunovNet | NormNet]
+    net: TrainState[LyapunovNet | NormNet]
     net_bar: LyapunovNet | NormNet  # slow copy, for targets that bootstrap
-    log_weight: Learnt[Scalar]
+    log_weight: TrainState[Scalar]
     gradient: Scalar  # the 95 % quantile over a batch of |grad L| by features, a running mean
     scale: Scalar  # running mean square of the fall of L, for `score`
 
@@ -110,19 +112,23 @@ class Lyapunov(AbstractConstraint):
             raise UserError(f"agents: {self.agents} names an agent twice.")
 
     @property
-    def foresight(self):
-        return self.horizon, self.target == "rollout"
+    def cost_window(self):
+        return CostWindow(self.horizon, beyond=self.target == "rollout")
 
     def fits(self, agents):
         for i in self.agents:
             within("--algorithm.constraint.agents", i, 0, agents - 1)
+
+    def paper(self):
+        """The weight of Delta L is learnt; the paper does not have the reading `critic`."""
+        return self if self.reading == "critic" else dataclasses.replace(self, weight=None)
 
     def init(self, shape, key):
         make = LyapunovNet if self.function == "squares" else NormNet
         net = make(shape, self.normalise, key=key)
         one = jnp.ones((), jnp.float32)
         log_weight = jnp.log(self.weight_start * one)
-        return Certificate(Learnt.of(net), net, Learnt.of(log_weight), one, one)
+        return LearnedLyapunov(TrainState.of(net), net, TrainState.of(log_weight), one, one)
 
     def lyapunov(self, L):
         return L.net.value
@@ -151,17 +157,17 @@ class Lyapunov(AbstractConstraint):
             term = self.surrogate(now, b, jax.lax.stop_gradient(advantage))
         return self.multiplier(L) * jnp.where(self.applies(b), term, 0.0)
 
-    def rise(self, L: Certificate, b: Transition, next_action: Action) -> Scalar:
+    def rise(self, L: LearnedLyapunov, b: Transition, next_action: Action) -> Scalar:
         """L(s', a') - L(s, a) + decrease c, without the margin slope ||a_phi - a|| of Theorem 1."""
         net = L.net.value
         fall = net(b.features, b.action) - net(b.next_features, next_action)
         return self.decrease * self.team(b.cost) - fall
 
-    def J_L(self, net, b: Transition, nxt: Sample, L: Certificate) -> Scalar:
+    def J_L(self, net, b: Transition, nxt: Sample, L: LearnedLyapunov) -> Scalar:
         """J_L = 1/2 (L(s, a) - L_target)^2, below (14)."""
         return 0.5 * (net(b.features, b.action) - self.L_target(L, b, nxt)) ** 2
 
-    def L_target(self, L: Certificate, b: Transition, nxt: Sample) -> Scalar:
+    def L_target(self, L: LearnedLyapunov, b: Transition, nxt: Sample) -> Scalar:
         """The sum of the next T costs: as rolled out, or bootstrapped from c and the slow L."""
         now, ahead = self.team(b.cost), self.team(b.cost_ahead)
         if self.target == "bootstrap":
@@ -183,16 +189,16 @@ class Lyapunov(AbstractConstraint):
         log_weight = eqx.tree_at(lambda w: w.value, log_weight, bounded)
 
         info = {"J_L": loss, "weight": self.multiplier(L), "rise": surplus}
-        certificate = Certificate(
+        learned = LearnedLyapunov(
             net,
             polyak(net.value, L.net_bar, self.tau),
             log_weight,
             self.steepness(L, b) if self.slope == "empirical" else L.gradient,
             0.99 * L.scale + 0.01 * jnp.mean((rises - jnp.mean(rises)) ** 2),
         )
-        return certificate, info
+        return learned, info
 
-    def multiplier(self, L: Certificate) -> Scalar:
+    def multiplier(self, L: LearnedLyapunov) -> Scalar:
         """The weight of Delta L; no gradient reaches it through J_pi."""
         if self.weight is not None:
             return jnp.asarray(self.weight)
@@ -215,7 +221,7 @@ class Lyapunov(AbstractConstraint):
         action = jnp.where(mine, drawn.action, jax.lax.stop_gradient(drawn.action))
         return drawn._replace(action=action)
 
-    def lipschitz(self, L: Certificate) -> Scalar:
+    def lipschitz(self, L: LearnedLyapunov) -> Scalar:
         """l_L l_f, the change of L per unit of action."""
         if self.slope == "empirical":
             return L.gradient * self.input_gain
@@ -223,7 +229,7 @@ class Lyapunov(AbstractConstraint):
             return L.net.value.lipschitz() * self.input_gain
         return jnp.asarray(self.slope)
 
-    def steepness(self, L: Certificate, b: Transition) -> Scalar:
+    def steepness(self, L: LearnedLyapunov, b: Transition) -> Scalar:
         """The running 95 % quantile of |grad L| by the critic's features.
 
         Not l_L of Theorem 1, which is a bound (not a quantile) by the state s (not its features).
