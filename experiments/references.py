@@ -8,7 +8,6 @@ from common import Case, experiment, options, schedule
 
 from marlyap.algorithms import ALGORITHMS
 from marlyap.off_policy import AbstractOffPolicy
-from marlyap.off_policy import AbstractOffPolicy
 from marlyap.tasks import TASKS
 
 
