@@ -92,6 +92,17 @@ def filled(make, *args, seed=0):
     return jax.tree.map(fill, eqx.filter_eval_shape(make, *args))
 
 
+def shrunk(algorithm, **sizes):
+    """The algorithm with those of these fields that it has, or that the one it wraps has."""
+    import dataclasses
+
+    if hasattr(algorithm, "sac"):
+        return dataclasses.replace(algorithm, sac=shrunk(algorithm.sac, **sizes))
+    return dataclasses.replace(
+        algorithm, **{field: n for field, n in sizes.items() if hasattr(algorithm, field)}
+    )
+
+
 def same(a, b):
     """Whether two trees are equal to the last bit, shapes and types included."""
     raw = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x

@@ -17,7 +17,8 @@ from scipy import stats
 
 from marlyap.algorithms import MASAC
 from marlyap.constraint import Unconstrained
-from marlyap.constraints.lyapunov import LearnedLyapunov, Lyapunov, distance
+from marlyap.constraints.lyapunov import LearnedLyapunov, Lyapunov
+from marlyap.constraints.readings import distance
 from marlyap.errors import UserError
 from marlyap.nets import MLP, Actors, Critic, Greedy, LyapunovNet, NormNet, Sampled, Shape
 from marlyap.optimiser import TrainState, polyak

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import filled, same
+from conftest import filled, same, shrunk
 from scipy import stats
 
 from marlyap import store
@@ -43,8 +43,7 @@ LIKE_THEM = (pytest.param(name, marks=pytest.mark.slow) for name in sorted({*ALG
 def test_what_is_handed_out_is_read_back(name, tmp_path):
     """The policy of a run is rebuilt from shapes alone before its arrays are read."""
     algorithm = ALGORITHMS[name]
-    small = {k: 4 for k in ("actor_width", "critic_width") if hasattr(algorithm, k)}
-    algorithm, game = dataclasses.replace(algorithm, **small), Rendezvous(horizon=40)
+    algorithm, game = shrunk(algorithm, actor_width=4, critic_width=4), Rendezvous(horizon=40)
     run = Run.create(tmp_path / "run", Trainer(game, algorithm, Schedule()), 0, {})
     learner = eqx.filter_jit(algorithm.init)(nets_shape(game), KEY)
     handed = (algorithm.policy(learner), algorithm.lyapunov(learner))
@@ -65,7 +64,7 @@ def test_alone_an_agent_has_its_own_row_and_observes_the_state(batch):
 
 
 def test_decentralised_agents_learn_nothing_from_each_other(shape, batch):
-    rule = DecentralisedSAC(**SMALL)
+    rule = DecentralisedSAC(MASAC(**SMALL))
     learner = eqx.filter_jit(rule.init)(shape, KEY)
     fields = ("obs", "features", "action", "reward", "next_obs", "next_features")
     change = lambda x: x.at[:, 2].multiply(0.5)
@@ -89,7 +88,7 @@ def test_decentralised_agents_learn_nothing_from_each_other(shape, batch):
 def test_centralised_agents_see_everything(shape, batch):
     obs = batch.obs[0]
     np.testing.assert_array_equal(joint(obs), np.tile(np.ravel(obs), (3, 1)))
-    rule = CentralisedSAC(**SMALL)
+    rule = CentralisedSAC(MASAC(**SMALL))
     learner = filled(rule.init, shape, KEY)
     for policy in (rule.policy(learner), rule.explore(learner)):
         moved = policy(obs.at[2].add(1.0), KEY) != policy(obs, KEY)
@@ -152,6 +151,8 @@ def test_presets_of_the_references():
             continue
         plain = PRESETS["paper"](rule)
         assert (plain.normalise, plain.heads, plain.ema_rate) == (False, "team", 1.0), name
+    for name in ("decentralised-sac", "centralised-sac"):
+        assert PRESETS["paper"](ALGORITHMS[name]).sac == PRESETS["paper"](MASAC())
     assert PRESETS["paper"](ALGORITHMS["critic-only"]).constraint.weight == 1.0
     assert PRESETS["paper"](ALGORITHMS["matd3"]).critics == 2
 
@@ -162,9 +163,9 @@ def test_presets_of_the_references():
         (lambda: MADDPG(noise=0.0), "noise:"),
         (lambda: MADDPG(critics=3), "critics:"),
         (lambda: MADDPG(delay=0), "delay:"),
-        (lambda: DecentralisedSAC(shared=True), "shared:"),
-        (lambda: DecentralisedSAC(constraint=Lyapunov()), "constraint:"),
-        (lambda: CentralisedSAC(shared=True), "shared:"),
+        (lambda: DecentralisedSAC(MASAC(shared=True)), "sac.shared:"),
+        (lambda: DecentralisedSAC(MASAC(constraint=Lyapunov())), "sac.constraint:"),
+        (lambda: CentralisedSAC(MASAC(shared=True)), "sac.shared:"),
         (lambda: Lyapunov(reading="critic", function="norm"), "function:"),
     ],
 )

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import shrunk
 
 from marlyap import programs, store, workers
 from marlyap.algorithms import ALGORITHMS, MASAC
@@ -54,12 +55,12 @@ SINGLE, PAIR = (5,), (5, 6)
 def trainer(name, schedule=SCHEDULE):
     """A tiny one; `name` may go on with a reading of the Lyapunov constraint, after a colon."""
     name, _, reading = name.partition(":")
-    algorithm, small = ALGORITHMS[name], dict(actor_width=4, critic_width=4, batch=4)
-    small = {field: size for field, size in small.items() if hasattr(algorithm, field)}
+    algorithm = shrunk(ALGORITHMS[name], actor_width=4, critic_width=4, batch=4)
     if reading:
         function = "norm" if reading == "score" else "squares"
-        small["constraint"] = Lyapunov(reading=reading, function=function)
-    return Trainer(GAME, dataclasses.replace(algorithm, **small), schedule)
+        constraint = Lyapunov(reading=reading, function=function)
+        algorithm = dataclasses.replace(algorithm, constraint=constraint)
+    return Trainer(GAME, algorithm, schedule)
 
 
 def runs_in(place, name, seeds):

@@ -37,8 +37,8 @@ ALGORITHMS = {
     "critic-only": MASAC(
         **QUICK, **COLD, use_Q=False, constraint=Lyapunov(reading="critic", **NEAR)
     ),
-    "decentralised-sac": DecentralisedSAC(**QUICK, **COLD),
-    "centralised-sac": CentralisedSAC(**QUICK, **COLD),
+    "decentralised-sac": DecentralisedSAC(MASAC(**QUICK, **COLD)),
+    "centralised-sac": CentralisedSAC(MASAC(**QUICK, **COLD)),
     "maddpg": MADDPG(**QUICK),
     "matd3": MADDPG(**QUICK, critics=2, smoothing=0.2, delay=2),
 }

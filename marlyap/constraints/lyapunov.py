@@ -46,6 +46,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from marlyap.constraint import AbstractConstraint
+from marlyap.constraints.readings import READINGS, Terms, mean_over, rise
 from marlyap.errors import UserError, within
 from marlyap.nets import LyapunovNet, NormNet, Sample
 from marlyap.optimiser import TrainState, polyak
@@ -69,9 +70,7 @@ class Lyapunov(AbstractConstraint):
     Raises UserError for values out of range and for readings and functions that do not fit.
     """
 
-    reading: Literal["han", "literal", "hinge", "score", "critic"] = (
-        "han"  # how Delta L is read (see above)
-    )
+    reading: str = "han"  # how Delta L is read: han, literal, hinge, score or critic
     function: Literal["squares", "norm"] = "squares"  # L(s, a) sum of squares, or V(s) norm-like
     horizon: int = 10  # T of L_target, in steps
     target: Literal["rollout", "hold_last", "bootstrap", "discounted"] = "rollout"  # what L learns
@@ -91,13 +90,19 @@ class Lyapunov(AbstractConstraint):
     tau: float = 0.005  # how fast the slow copy of L follows
 
     def __check_init__(self):
-        if self.function == "norm" and self.reading in ("han", "critic"):
+        if self.reading not in READINGS:
+            names = ", ".join(READINGS)
+            raise UserError(f"reading: '{self.reading}' is unknown; take one of {names}.")
+        fit = READINGS[self.reading].functions
+        if self.function == "norm" not in fit:
+            others = [name for name, r in READINGS.items() if "norm" in r.functions]
             raise UserError(
                 "function: 'norm' is a function of the state alone, which gives the reading "
-                f"'{self.reading}' no gradient; take reading score or hinge, or function squares."
+                f"'{self.reading}' no gradient; take function squares or a reading among "
+                f"{', '.join(others)}."
             )
-        if self.function == "squares" and self.reading == "score":
-            raise UserError("reading: 'score' needs function norm.")
+        if self.function not in fit:
+            raise UserError(f"reading: '{self.reading}' needs function {' or '.join(fit)}.")
         if self.function == "squares" and self.slope == "spectral":
             raise UserError("slope: 'spectral' needs function norm.")
         within("horizon", self.horizon, 1, 10_000)
@@ -121,7 +126,8 @@ class Lyapunov(AbstractConstraint):
 
     def paper(self):
         """The weight of Delta L is learnt; the paper does not have the reading `critic`."""
-        return self if self.reading == "critic" else dataclasses.replace(self, weight=None)
+        learnt = READINGS[self.reading].condition
+        return dataclasses.replace(self, weight=None) if learnt else self
 
     def init(self, shape, key):
         make = LyapunovNet if self.function == "squares" else NormNet
@@ -139,29 +145,27 @@ class Lyapunov(AbstractConstraint):
         The action in the memory is b.action; `now` and `nxt` are drawn from the current policy at s
         and s'.
         """
-        now, nxt = self.held(now), self.held(nxt)
-        net, moved = L.net.value, distance(now.action, b.action)
-        if self.reading == "han":
-            term = self.rise(L, b, nxt.action)
-        elif self.reading == "literal":
-            term = self.rise(L, b, jax.lax.stop_gradient(nxt.action)) + self.lipschitz(L) * moved
-        elif self.reading == "hinge":
-            rise = jax.lax.stop_gradient(self.rise(L, b, nxt.action))
-            bound = jax.nn.relu(rise + self.lipschitz(L) * moved)
-            term = jnp.where(rise <= 0, bound, 0.0)
-        elif self.reading == "critic":
-            term = net(b.features, now.action)
-        else:
-            fall = net(b.features, b.action) - net(b.next_features, b.action)
-            advantage = (fall - self.decrease * self.team(b.cost)) / jnp.sqrt(L.scale)
-            term = self.surrogate(now, b, jax.lax.stop_gradient(advantage))
+        terms = Terms(
+            L=L.net.value,
+            b=b,
+            now=self.held(now),
+            nxt=self.held(nxt),
+            due=self.due(b),
+            slope=self.lipschitz(L),
+            scale=L.scale,
+            clip=self.clip,
+            agents=self.agents,
+        )
+        term = READINGS[self.reading](terms)
         return self.multiplier(L) * jnp.where(self.applies(b), term, 0.0)
 
     def rise(self, L: LearnedLyapunov, b: Transition, next_action: Action) -> Scalar:
         """L(s', a') - L(s, a) + decrease c, without the margin slope ||a_phi - a|| of Theorem 1."""
-        net = L.net.value
-        fall = net(b.features, b.action) - net(b.next_features, next_action)
-        return self.decrease * self.team(b.cost) - fall
+        return rise(L.net.value, b, next_action, self.due(b))
+
+    def due(self, b: Transition) -> Scalar:
+        """decrease c: L must fall by so much."""
+        return self.decrease * self.team(b.cost)
 
     def J_L(self, net, b: Transition, nxt: Sample, L: LearnedLyapunov) -> Scalar:
         """J_L = 1/2 (L(s, a) - L_target)^2, below (14)."""
@@ -210,7 +214,7 @@ class Lyapunov(AbstractConstraint):
 
     def team(self, per_agent: Float[Array, "agent"]) -> Scalar:
         """The mean over the agents that the constraint is about."""
-        return jnp.mean(per_agent[jnp.array(self.agents)] if self.agents else per_agent)
+        return mean_over(self.agents, per_agent)
 
     def held(self, drawn: Sample) -> Sample:
         """The drawn actions, with a gradient only for the agents that the constraint is about."""
@@ -237,16 +241,3 @@ class Lyapunov(AbstractConstraint):
         total = lambda features: jnp.sum(jax.vmap(L.net.value)(features, b.action))
         size = jnp.sqrt(jnp.sum(jax.grad(total)(b.features) ** 2, axis=(1, 2)))
         return 0.99 * L.gradient + 0.01 * jnp.quantile(size, 0.95)
-
-    def surrogate(self, now: Sample, b: Transition, advantage: Scalar) -> Scalar:
-        """-min(ratio A, clipped ratio A), the mean over agents of each one's own ratio."""
-        ratio = jnp.exp(jnp.clip(now.log_prob_memory - b.log_prob, -20.0, 20.0))
-        near = jnp.clip(ratio, 1 - self.clip, 1 + self.clip)
-        return -self.team(jnp.minimum(ratio * advantage, near * advantage))
-
-
-def distance(a: Action, b: Action) -> Scalar:
-    """||a - b||, with a gradient of 0 where they are equal."""
-    square = jnp.sum((a - b) ** 2)
-    safe = jnp.where(square > 0, square, 1.0)
-    return jnp.where(square > 0, jnp.sqrt(safe), 0.0)
