@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PyTree
 
+from marlyap.nets import Actors
 from marlyap.trainer import Carry, Trainer
 
 
@@ -24,8 +25,9 @@ def diagnose(trainer: Trainer, carry: Carry, iteration: int) -> str | None:
         if (table >= 0).any():
             update = int(np.argmax((table >= 0).any(axis=1)))
             column = int(np.argmax(table[update] >= 0))
-            path, leaf = _numbers(trainer.algorithm.networks(carry.learner))[column]
-            who = _agent(trainer, path, leaf, int(table[update, column]))
+            networks = trainer.algorithm.networks(carry.learner)
+            path, leaf = _numbers(networks)[column]
+            who = _agent(networks, trainer.game.agents, path, leaf, int(table[update, column]))
             return f"{_words(path)}{who} in update {update + 1} of iteration {now}"
     return None
 
@@ -59,9 +61,10 @@ def _words(path: str) -> str:
     return f"{kind} {re.sub(r'[.]value|[.]memory|[.]mu|[.]nu', '', path).lstrip('.')}"
 
 
-def _agent(trainer: Trainer, path: str, leaf: Array, index: int) -> str:
+def _agent(networks: PyTree, agents: int, path: str, leaf: Array, index: int) -> str:
     """The agent, where the actors have a leading axis of agents."""
-    agents, shared = trainer.game.agents, getattr(trainer.algorithm, "shared", False)
-    if not path.startswith(".pi") or shared or leaf.ndim == 0 or len(leaf) != agents:
+    parts = jax.tree.leaves(networks, is_leaf=lambda x: isinstance(x, Actors))
+    own = any(isinstance(x, Actors) and x.shared is False for x in parts)  # None in the optimiser's
+    if not path.startswith(".pi") or not own or leaf.ndim == 0 or len(leaf) != agents:
         return ""
     return f" of agent {index // (leaf.size // agents)}"
