@@ -339,6 +339,7 @@ SPOILT = {
     "of another program": (lambda a: '{"name": "x", "version": 3}', ["lacks some of its fields"]),
     "without its task": (drop("task"), ["lacks some of its fields"]),
     "newer": (put("schema", 99), ["schema 99"]),
+    "older": (put("schema", 1), ["schema 1", "train it again"]),
     "seed of the wrong kind": (put("seed", "0"), ["seed or names of the wrong kind"]),
     "names of the wrong kind": (put("names", []), ["seed or names of the wrong kind"]),
     "unknown task": (put("task.kind", "Mine"), ["task: 'Mine'", "--task path/to/file.py:Mine"]),
