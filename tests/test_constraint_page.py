@@ -10,6 +10,7 @@ import pytest
 from conftest import filled
 from test_docs import blocks
 
+from marlyap import config
 from marlyap.constraints import Lyapunov
 from marlyap.constraints.readings import READINGS
 from marlyap.nets import Sample
@@ -64,3 +65,8 @@ def test_a_reading_is_a_class_and_a_line(page, shape, batch, monkeypatch):
     assert found
     with pytest.raises(Exception, match="^function: 'norm' .* take function squares or a reading"):
         Lyapunov(reading="squared", function="norm")
+
+
+def test_the_help_lists_every_reading():
+    (note,) = (n for option, _, n in config.describe(Lyapunov(), "L") if option == "L.reading")
+    assert note.endswith(f"one of {', '.join(READINGS)}")

@@ -70,7 +70,7 @@ class Lyapunov(AbstractConstraint):
     Raises UserError for values out of range and for readings and functions that do not fit.
     """
 
-    reading: str = "han"  # how Delta L is read: han, literal, hinge, score or critic
+    reading: str = "han"  # how Delta L is read; one of han, literal, hinge, score, critic
     function: Literal["squares", "norm"] = "squares"  # L(s, a) sum of squares, or V(s) norm-like
     horizon: int = 10  # T of L_target, in steps
     target: Literal["rollout", "hold_last", "bootstrap", "discounted"] = "rollout"  # what L learns
