@@ -174,8 +174,8 @@ GUARDS = [
         FIT,
         (
             (
-                "fault = _fault(line, told.health_of(i), trainer.game.agents)\n            if fault and",
-                "fault: Any = None\n            if fault and",
+                "told.health_of(i), trainer.game.agents)\n            if fault and",
+                "told.health_of(i), trainer.game.agents) and None\n            if fault and",
             ),
         ),
         "tests/test_resume.py::test_when_all_diverge_training_stops_and_the_checkpoints_stay",
