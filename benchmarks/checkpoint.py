@@ -36,7 +36,7 @@ def main(argv=None):
             schedule = Schedule(steps=count, capacity=count)
             trainer = Trainer(Rendezvous(agents=n), MASAC(constraint=Lyapunov()), schedule)
             carry = begin(trainer, 0)
-            size = sum(np.asarray(x).nbytes for x in jax.tree.leaves(carry.memory))
+            size = sum(np.asarray(x).nbytes for x in jax.tree.leaves(carry.learner.memory))
             seconds = []
             with tempfile.TemporaryDirectory() as place:
                 run = Run.create(Path(place) / "run", trainer, 0, {})

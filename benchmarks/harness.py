@@ -26,8 +26,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from marlyap.algorithm import AbstractAlgorithm
 from marlyap.game import AbstractGame
+from marlyap.off_policy import AbstractOffPolicy
 from marlyap.trainer import Schedule, Trainer
 
 
@@ -110,7 +110,7 @@ class Updates:
 
 
 def updates(
-    game: AbstractGame, algorithm: AbstractAlgorithm, count: int, episodes: int = 64
+    game: AbstractGame, algorithm: AbstractOffPolicy, count: int, episodes: int = 64
 ) -> Updates:
     """`count` updates, a divisor of the horizon, from `episodes` random episodes, compiled."""
     trainer = Trainer(
@@ -124,19 +124,20 @@ def updates(
             capacity=1,
         ),
     )
-    carry = eqx.filter_jit(trainer.begin)(jax.random.key(0))
-    dynamic, static = eqx.partition(carry.learner, eqx.is_array)
+    learner = eqx.filter_jit(trainer.begin)(jax.random.key(0))[0].learner
+    dynamic, static = eqx.partition(learner.networks, eqx.is_array)
+    updates = trainer.updates_per_iteration
 
     def several(dynamic, memory, key):
-        learner = eqx.combine(dynamic, static)
-        learner, _, _ = trainer.learn(learner, memory, key, jnp.ones(()), lambda learner: None)
-        return eqx.filter(learner, eqx.is_array)
+        networks = eqx.combine(dynamic, static)
+        networks, _, _ = algorithm.improve(networks, memory, updates, key, jnp.ones(()))
+        return eqx.filter(networks, eqx.is_array)
 
     key = jax.random.key(1)
-    compiled = jax.jit(several).lower(dynamic, carry.memory, key).compile()
+    compiled = jax.jit(several).lower(dynamic, learner.memory, key).compile()
     return Updates(
-        run=lambda: jax.block_until_ready(compiled(dynamic, carry.memory, key)),
-        count=trainer.updates_per_iteration,
+        run=lambda: jax.block_until_ready(compiled(dynamic, learner.memory, key)),
+        count=updates,
         xla=(compiled.cost_analysis() or {}).get("flops", math.nan),
         products=Counter({p: k for p, k in products(compiled.as_text()).items() if p.proper}),
         memory=compiled.memory_analysis().temp_size_in_bytes,

@@ -23,9 +23,9 @@ def child(args):
     quick = {"steps": 24, "environments": 2, "steps_per_update": 4, "warmup": 8}
     game = Rendezvous(agents=args.agents[0], horizon=4 if args.quick else 40)
     trainer = Trainer(game, MASAC(constraint=Lyapunov()), Schedule(**(quick if args.quick else {})))
-    carry = eqx.filter_jit(trainer.begin)(jax.random.key(0))
+    carry, _ = eqx.filter_jit(trainer.begin)(jax.random.key(0))
     iterate = eqx.filter_jit(trainer.iterate, donate="all").lower(carry).compile()
-    parts = {"learner MB": size(carry.learner), "memory MB": size(carry.memory)}
+    parts = {"learner MB": size(carry.learner.networks), "memory MB": size(carry.learner.memory)}
     scratch = iterate.compiled.memory_analysis().temp_size_in_bytes / 2**20
     for _ in range(2):
         carry = jax.block_until_ready(iterate(carry)[0])

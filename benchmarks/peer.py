@@ -58,7 +58,7 @@ def ours(agents, constraint, preset, quick):
     )
     algorithm = PRESETS[preset](MASAC(**small, **constraint))
     trainer = Trainer(Rendezvous(agents=agents, horizon=horizon), algorithm, schedule)
-    carry = [eqx.filter_jit(trainer.begin)(jax.random.key(0))]
+    carry = [eqx.filter_jit(trainer.begin)(jax.random.key(0))[0]]
     iterate = eqx.filter_jit(lambda carry: trainer.iterate(carry)[0], donate="all")
 
     def run():

@@ -32,7 +32,7 @@ def job(trainer, way, seeds):
     alone = seeds == 1
     each = lambda f: f if alone else eqx.filter_vmap(f)
     keys = jax.random.split(jax.random.key(0), seeds)
-    state = [eqx.filter_jit(each(trainer.begin))(keys[0] if alone else keys)]
+    state = [eqx.filter_jit(each(trainer.begin))(keys[0] if alone else keys)[0]]
 
     @eqx.filter_jit(donate="all")
     def iterate(carry):

@@ -20,7 +20,7 @@ import harness
 from marlyap import MASAC, Lyapunov, Rendezvous
 from marlyap.algorithms import PRESETS
 from marlyap.nets import Shape
-from marlyap.trainer import shape
+from marlyap.source import shape
 
 
 def needed(algorithm: MASAC, s: Shape) -> float:

@@ -22,7 +22,7 @@ WITHOUT = {
     "without decay": ({}, {"decay": 1.0}),
     "without LayerNorm": ({"normalise": False}, {}),
     "without a head for each agent": ({"heads": "team"}, {}),
-    "without averaged weights": ({"average": 1.0}, {}),
+    "without averaged weights": ({"ema_rate": 1.0}, {}),
     "without the doubled reward": ({"reward_scale": 1.0}, {}),
     "16 environments": ({}, {"environments": 16}),
     "1 environment": ({}, {"environments": 1, "judge_every": 512}),
@@ -35,7 +35,7 @@ WITH = {
     "paper": ({}, {}),
     "paper and LayerNorm": ({"normalise": True}, {}),
     "paper and a head for each agent": ({"heads": "agent"}, {}),
-    "paper and averaged weights": ({"average": TUNED.average}, {}),
+    "paper and averaged weights": ({"ema_rate": TUNED.ema_rate}, {}),
     "paper and 64 environments": ({}, {"environments": 64, "judge_every": 4}),
 }
 

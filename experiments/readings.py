@@ -31,24 +31,24 @@ READINGS = {
 def settings():
     """Each constraint once, and whether Q is kept; none first, to compare with."""
     yield None, True
-    for keep_Q in (True, False):
+    for use_Q in (True, False):
         for reading in READINGS.values():
-            yield reading, keep_Q
+            yield reading, use_Q
         for reading in (READINGS["han"], READINGS["critic"]):
             for horizon in HORIZONS:
-                yield replace(reading, horizon=horizon), keep_Q
+                yield replace(reading, horizon=horizon), use_Q
         for decrease in DECREASES:
-            yield replace(READINGS["han"], decrease=decrease), keep_Q
+            yield replace(READINGS["han"], decrease=decrease), use_Q
         for weight in WEIGHTS:
-            yield replace(READINGS["han"], weight=weight), keep_Q
-            yield replace(READINGS["score"], weight=weight), keep_Q
+            yield replace(READINGS["han"], weight=weight), use_Q
+            yield replace(READINGS["score"], weight=weight), use_Q
 
 
 def cases(args):
-    for L, keep_Q in settings():
-        about = {"task": args.task, "reading": "none", "Q": "Q" if keep_Q else "no-Q"}
+    for L, use_Q in settings():
+        about = {"task": args.task, "reading": "none", "Q": "Q" if use_Q else "no-Q"}
         about |= {"horizon": "", "decrease": "", "weight": ""}
-        algorithm = MASAC(keep_Q=keep_Q)
+        algorithm = MASAC(use_Q=use_Q)
         if L is not None:
             weight = "learnt" if L.weight is None else L.weight
             about |= {"reading": L.reading, "horizon": f"T={L.horizon}"}

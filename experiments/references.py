@@ -6,8 +6,8 @@
 
 from common import Case, experiment, options, schedule
 
-from marlyap.algorithm import AbstractOffPolicy
 from marlyap.algorithms import ALGORITHMS
+from marlyap.off_policy import AbstractOffPolicy
 from marlyap.tasks import TASKS
 
 

@@ -9,7 +9,7 @@ from importlib import import_module
 
 TYPE_CHECKING = False  # `typing` takes longer to import than all that a command's start needs
 if TYPE_CHECKING:
-    from marlyap.algorithm import AbstractOffPolicy as AbstractOffPolicy
+    from marlyap.algorithm import AbstractAlgorithm as AbstractAlgorithm
     from marlyap.algorithms import APG as APG, MASAC as MASAC
     from marlyap.certificate import AbstractCertificate as AbstractCertificate
     from marlyap.certify import certify as certify
@@ -32,17 +32,21 @@ if TYPE_CHECKING:
         Tolerance as Tolerance,
     )
     from marlyap.lyapunov_function import AbstractLyapunov as AbstractLyapunov
+    from marlyap.off_policy import AbstractOffPolicy as AbstractOffPolicy
+    from marlyap.on_policy import AbstractOnPolicy as AbstractOnPolicy
     from marlyap.physics import AbstractPlant as AbstractPlant
     from marlyap.planar import AbstractPlanar as AbstractPlanar, Goals as Goals
     from marlyap.rollout import Decentralised as Decentralised, rollout as rollout
     from marlyap.run import Run as Run
     from marlyap.runs.launch import Launch as Launch, launch as launch
+    from marlyap.schedule import Schedule as Schedule
+    from marlyap.source import AbstractSource as AbstractSource, Simulated as Simulated
     from marlyap.tasks import Formation as Formation, Rendezvous as Rendezvous
-    from marlyap.trainer import Schedule as Schedule, Trainer as Trainer
+    from marlyap.trainer import Trainer as Trainer
     from marlyap.types import State as State
 
 PUBLIC = {
-    "algorithm": ("AbstractOffPolicy",),
+    "algorithm": ("AbstractAlgorithm",),
     "algorithms": ("APG", "MASAC"),
     "certificate": ("AbstractCertificate",),
     "certify": ("certify",),
@@ -63,11 +67,15 @@ PUBLIC = {
     "physics": ("AbstractPlant",),
     "planar": ("AbstractPlanar", "Goals"),
     "lyapunov_function": ("AbstractLyapunov",),
+    "off_policy": ("AbstractOffPolicy",),
+    "on_policy": ("AbstractOnPolicy",),
     "rollout": ("Decentralised", "rollout"),
     "run": ("Run",),
     "runs.launch": ("Launch", "launch"),
+    "schedule": ("Schedule",),
+    "source": ("AbstractSource", "Simulated"),
     "tasks": ("Formation", "Rendezvous"),
-    "trainer": ("Schedule", "Trainer"),
+    "trainer": ("Trainer",),
     "types": ("State",),
 }
 _HOME = {name: module for module, names in PUBLIC.items() for name in names}

@@ -1,70 +1,124 @@
-"""What every learning rule offers: a learner to begin with, one update, and its policies."""
+"""What every algorithm offers: it begins, iterates, and says which policy is deployed."""
 
 import abc
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from marlyap.game import AbstractGame
+from marlyap.devices import gathered
+from marlyap.health import Health
 from marlyap.nets import LyapunovNet, NormNet, Shape
+from marlyap.replay import Episode
 from marlyap.rollout import AbstractExplorer, Policy
-from marlyap.types import Key, Keys, Scalar, Transition
+from marlyap.schedule import Schedule
+from marlyap.source import CostWindow, Play
+from marlyap.types import Key, Scalar
+
+
+Log = dict[str, Scalar]
+Watch = Callable[[PyTree], PyTree]  # asked about the networks after each update
+
+
+def unwatched(networks: PyTree) -> None:
+    """Nobody asks."""
+
+
+class KeyPair(NamedTuple):
+    """Two independent streams, so that what is played does not depend on how one learns."""
+
+    play: Key
+    learn: Key
+
+
+class Info(NamedTuple):
+    """What an iteration tells."""
+
+    log: Log
+    health: Health
+    seen: PyTree = None  # what `watch` returned, with a leading axis `update`
 
 
 class AbstractAlgorithm(eqx.Module):
-    """The fields of a subclass are its hyperparameters: the object is its own configuration.
+    """Owns its iteration. The fields of a subclass are its hyperparameters and its configuration.
 
-    A learning rule is one of two kinds, below: it learns from a memory of what was played, or by
-    differentiating the game itself.
+    `networks` are all that gradients move, with the optimisers' states; a `learner` is the networks
+    and whatever else lasts from one iteration to the next.
     """
+
+    default_schedule: ClassVar[Schedule | None] = None  # None: the one named after the preset
 
     def fits(self, agents: int) -> None:
         """Raise UserError if it cannot train a team of so many agents; the default takes any."""
 
-    @abc.abstractmethod
-    def init(self, shape: Shape, key: Key) -> PyTree:
-        """Fresh parameters and optimiser memories."""
+    def paper(self) -> "AbstractAlgorithm":
+        """The same with the settings of section 4 of the paper; the default has none."""
+        return self
 
     @abc.abstractmethod
-    def exploit(self, learner: PyTree) -> Policy:
+    def updates_per_iteration(self, play: Play) -> int:
+        """Gradient steps in one iteration, for the log."""
+
+    @abc.abstractmethod
+    def init(self, shape: Shape, key: Key) -> PyTree:
+        """Fresh networks."""
+
+    @abc.abstractmethod
+    def begin(self, play: Play, keys: KeyPair) -> tuple[PyTree, Health]:
+        """A fresh learner, and the health of what was played for it."""
+
+    @abc.abstractmethod
+    def iterate(
+        self, learner: PyTree, play: Play, keys: KeyPair, decay: Scalar, watch: Watch = unwatched
+    ) -> tuple[PyTree, Info]:
+        """Play and learn once, with all learning rates multiplied by `decay`."""
+
+    def networks(self, learner: PyTree) -> PyTree:
+        """The networks of a learner; the default is all of it."""
+        return learner
+
+    @abc.abstractmethod
+    def policy(self, networks: PyTree) -> Policy:
         """The deterministic policy that is evaluated, certified and deployed."""
 
     @abc.abstractmethod
-    def lyapunov(self, learner: PyTree) -> LyapunovNet | NormNet | None:
+    def lyapunov(self, networks: PyTree) -> LyapunovNet | NormNet | None:
         """The Lyapunov function (features, action) -> L learnt so far, if there is one."""
 
 
-class AbstractOffPolicy(AbstractAlgorithm):
-    """Learns from transitions that any policy may have left in the replay memory."""
-
-    gamma: eqx.AbstractVar[float]
-    batch: eqx.AbstractVar[int]
-    n_step: eqx.AbstractVar[int]
+class AbstractFromData(AbstractAlgorithm):
+    """Learns from episodes alone, whoever played them: an iteration plays, then learns."""
 
     @property
     @abc.abstractmethod
-    def foresight(self) -> tuple[int, bool]:
-        """T of L_target, and whether episodes are to be rolled T steps further to have it."""
+    def cost_window(self) -> CostWindow:
+        """Which sums of costs its episodes hold; CostWindow() where it needs none."""
 
     @abc.abstractmethod
-    def update(
-        self, learner: PyTree, b: Transition, decay: Scalar
-    ) -> tuple[PyTree, dict[str, Scalar]]:
-        """One gradient step on a batch, rates multiplied by `decay`; the dict is for the log.
-
-        What is random in it comes with the batch, as `b.noise`.
-        """
-
-    @abc.abstractmethod
-    def explore(self, learner: PyTree) -> AbstractExplorer:
+    def explore(self, networks: PyTree) -> AbstractExplorer:
         """The policy that collects data."""
 
-
-class AbstractModelBased(AbstractAlgorithm):
-    """Learns from episodes that it plays itself, whose gradient it takes through the dynamics."""
-
     @abc.abstractmethod
-    def improve(
-        self, learner: PyTree, game: AbstractGame, keys: Keys, decay: Scalar
-    ) -> tuple[PyTree, dict[str, Scalar]]:
-        """One gradient step on the episodes of these keys; the dict has at least `return`."""
+    def learn(
+        self,
+        learner: PyTree,
+        new: Episode,
+        schedule: Schedule,
+        key: Key,
+        decay: Scalar,
+        watch: Watch = unwatched,
+    ) -> tuple[PyTree, Log, PyTree]:
+        """All updates of an iteration from its new episodes (leading axis `episode`).
+
+        Returns the learner, the log (means over the updates) and what `watch` saw after each.
+        """
+
+    def iterate(self, learner, play, keys, decay, watch=unwatched):
+        """Play `environments` episodes, and learn from them."""
+        explorer, episodes = self.explore(self.networks(learner)), play.schedule.environments
+        new = gathered(play(explorer, keys.play, episodes, self.cost_window))
+        learner, log, seen = self.learn(learner, new, play.schedule, keys.learn, decay, watch)
+        log["return"] = jnp.mean(jnp.sum(jnp.mean(new.reward, axis=2), axis=1))
+        return learner, Info(log, Health.of(new), seen)

@@ -28,8 +28,8 @@ from marlyap.controllers import CONTROLLERS, AbstractController
 from marlyap.dynamics import DYNAMICS, AbstractDynamics
 from marlyap.errors import UserError, first_line, raised_at, whole
 from marlyap.game import AbstractGame
+from marlyap.schedule import Schedule
 from marlyap.tasks import TASKS
-from marlyap.trainer import Schedule
 
 
 T = TypeVar("T")
@@ -355,9 +355,17 @@ def _parse_as(text: str, kind: Any) -> Any:
         return tuple(
             _parse_as(part.strip(), item) for part in text.strip("()[]").split(",") if part
         )
-    if kind in FAMILIES and text in FAMILIES[kind]:
-        return FAMILIES[kind][text]
+    if text in (members := _members(kind)):
+        return members[text]
     raise ValueError(text)
+
+
+def _members(kind: Any) -> dict[str, Any]:
+    """The objects of this class that have a name."""
+    tables = [
+        t for family, t in FAMILIES.items() if isinstance(kind, type) and issubclass(kind, family)
+    ]
+    return {name: o for table in tables for name, o in table.items() if isinstance(o, kind)}
 
 
 def _finite(value: float) -> float:
@@ -398,8 +406,8 @@ def _expected(hint: Any) -> str:
             names += map(str, typing.get_args(kind))
         elif typing.get_origin(kind) is tuple:
             names.append(f"{typing.get_args(kind)[0].__name__}s with commas between")
-        elif kind in FAMILIES:
-            names += FAMILIES[kind]
+        elif members := _members(kind):
+            names += members
         else:
             plain = {int: "a whole number", float: "a number", bool: "true or false"}
             names.append("none" if kind is type(None) else plain.get(kind, kind.__name__))
@@ -416,7 +424,7 @@ def _choices(hint: Any) -> list[str]:
     found: list[str] = []
     for kind in _alternatives(hint):
         found += map(str, typing.get_args(kind)) if typing.get_origin(kind) is Literal else ()
-        found += FAMILIES.get(kind, ())
+        found += _members(kind)
     return found
 
 

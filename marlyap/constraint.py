@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from marlyap.nets import LyapunovNet, NormNet, Sample, Shape
+from marlyap.source import CostWindow
 from marlyap.types import Key, Scalar, Transition
 
 
@@ -15,11 +16,15 @@ class AbstractConstraint(eqx.Module):
 
     @property
     @abc.abstractmethod
-    def foresight(self) -> tuple[int, bool]:
-        """T of L_target, and whether episodes are to be rolled T steps further to have it."""
+    def cost_window(self) -> CostWindow:
+        """Which sums of costs episodes are to hold for its L_target."""
 
     def fits(self, agents: int) -> None:
         """Raise UserError if it cannot be asked of a team of so many agents."""
+
+    def paper(self) -> "AbstractConstraint":
+        """The same as section 4 of the paper has it; the default has nothing to change."""
+        return self
 
     @abc.abstractmethod
     def init(self, shape: Shape, key: Key) -> PyTree:
@@ -44,8 +49,8 @@ class Unconstrained(AbstractConstraint):
     """Algorithm 1: nothing is added."""
 
     @property
-    def foresight(self):
-        return 1, False
+    def cost_window(self):
+        return CostWindow()
 
     def init(self, shape, key):
         return None

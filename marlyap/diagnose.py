@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PyTree
 
+from marlyap.nets import Actors
 from marlyap.trainer import Carry, Trainer
 
 
@@ -24,28 +25,29 @@ def diagnose(trainer: Trainer, carry: Carry, iteration: int) -> str | None:
         if (table >= 0).any():
             update = int(np.argmax((table >= 0).any(axis=1)))
             column = int(np.argmax(table[update] >= 0))
-            path, leaf = _numbers(carry.learner)[column]
-            who = _agent(trainer, path, leaf, int(table[update, column]))
+            networks = trainer.algorithm.networks(carry.learner)
+            path, leaf = _numbers(networks)[column]
+            who = _agent(networks, trainer.game.agents, path, leaf, int(table[update, column]))
             return f"{_words(path)}{who} in update {update + 1} of iteration {now}"
     return None
 
 
 @eqx.filter_jit(donate="all-except-first")
 def _watched(trainer: Trainer, carry: Carry) -> tuple[Carry, list[Int[Array, "update"]]]:
-    after, _, marks = trainer.watched(carry, first_faults)
-    return after, marks
+    after, info = trainer.iterate(carry, first_faults)
+    return after, info.seen
 
 
-def _numbers(learner: PyTree) -> list[tuple[str, Array]]:
-    """The arrays of a learner by their path: the optimisers' memories first, as gradients do."""
-    leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(learner, eqx.is_inexact_array))
+def _numbers(networks: PyTree) -> list[tuple[str, Array]]:
+    """The arrays of the networks by their path: the optimisers' memories first, as gradients do."""
+    leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(networks, eqx.is_inexact_array))
     named = [(jax.tree_util.keystr(path), leaf) for path, leaf in leaves]
     return sorted(named, key=lambda pair: ".mu" not in pair[0])
 
 
-def first_faults(learner: PyTree) -> list[Int[Array, ""]]:
+def first_faults(networks: PyTree) -> list[Int[Array, ""]]:
     """For every array the flat index of its first number that is not finite, or -1."""
-    return [_first(leaf) for _, leaf in _numbers(learner)]
+    return [_first(leaf) for _, leaf in _numbers(networks)]
 
 
 def _first(leaf: Array) -> Int[Array, ""]:
@@ -59,9 +61,10 @@ def _words(path: str) -> str:
     return f"{kind} {re.sub(r'[.]value|[.]memory|[.]mu|[.]nu', '', path).lstrip('.')}"
 
 
-def _agent(trainer: Trainer, path: str, leaf: Array, index: int) -> str:
+def _agent(networks: PyTree, agents: int, path: str, leaf: Array, index: int) -> str:
     """The agent, where the actors have a leading axis of agents."""
-    agents, shared = trainer.game.agents, getattr(trainer.algorithm, "shared", False)
-    if not path.startswith(".pi") or shared or leaf.ndim == 0 or len(leaf) != agents:
+    parts = jax.tree.leaves(networks, is_leaf=lambda x: isinstance(x, Actors))
+    own = any(isinstance(x, Actors) and x.shared is False for x in parts)  # None in the optimiser's
+    if not path.startswith(".pi") or not own or leaf.ndim == 0 or len(leaf) != agents:
         return ""
     return f" of agent {index // (leaf.size // agents)}"

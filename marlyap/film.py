@@ -275,7 +275,7 @@ def one(
             f"episode: {index} is out of range; the evaluation has 0 to {episodes - 1}."
         )
     there = run.game if game is None else game
-    _, L = run.handed_out()
+    _, L = run.deployed()
     keys = jax.random.split(stream(seed, "evaluate"), episodes)
     controller = run.controller(game)
     path = _episode(there, controller, keys[index])

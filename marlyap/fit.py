@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
-from itertools import chain, groupby
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,15 +20,16 @@ from marlyap.cache import enable_cache
 from marlyap.diagnose import diagnose
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
+from marlyap.health import Health, TaskFault
 from marlyap.nets import LyapunovNet, NormNet
 from marlyap.progress import show
 from marlyap.rollout import Decentralised, Policy
-from marlyap.run import FROM_TASK, Run, begin, sound
+from marlyap.run import Run, begin, sound
+from marlyap.schedule import Schedule
 from marlyap.tasks import TASKS
-from marlyap.trainer import Carry, Schedule, Trainer, schedule_for
+from marlyap.trainer import Carry, Trainer, schedule_for
 
 
-BY_TASK = [f"bad_{name}" for name in (*FROM_TASK, "sign")]
 SHARE = 0.02  # of the training time that checkpoints may take
 PATIENCE = 20.0  # seconds between checkpoints at least
 
@@ -112,36 +113,44 @@ def _together(
     before, clock = max(one.seconds for one in loaded), time.monotonic()
     saved, alive = _Saved(clock), [True] * len(runs)
 
-    for done, carry, rows in advance(trainer, first, stop):
+    for done, carry, told in advance(trainer, first, stop):
         seconds = before + time.monotonic() - clock
         for i, run in enumerate(runs):
-            line = _line(trainer, run.seed, done, seconds, rows, i)
-            fault = _fault(line)
+            line = _line(trainer, run.seed, done, seconds, told.log, i)
+            fault = _fault(line, told.health_of(i), trainer.game.agents)
             if fault and alive[i]:
                 alive[i] = False
-                where = (
-                    None if f"bad_{fault}" in BY_TASK else diagnose(trainer, run.load()[0], done)
-                )
-                says = _advice(fault, line, trainer.game.agents, where) + f" in {run.directory}."
+                where = None if fault.by_task else diagnose(trainer, run.load()[0], done)
+                says = f"{fault.says(where)} in {run.directory}."
                 faults[run.seed] = Diverged(says)
-                yield events.Diverged(*run.named, done, fault, says)
+                yield events.Diverged(*run.named, done, fault.name, says)
                 if not any(alive):
                     return faults
             if alive[i]:
-                run.log(_told(line))
-                yield events.Progress(*run.named, _told(line), trainer.iterations)
+                run.log(line)
+                yield events.Progress(*run.named, line, trainer.iterations)
         if saved.due():
             yield from saved.save(runs, carry, alive, seconds)
     yield from saved.save(runs, carry, alive, before + time.monotonic() - clock)
     return faults
 
 
+class Told(NamedTuple):
+    """What an iteration tells of every run: the arrays have a leading axis of runs."""
+
+    log: dict[str, np.ndarray]
+    health: Health
+
+    def health_of(self, i: int) -> Health:
+        return Health(*[at[i] for at in self.health])
+
+
 def advance(
     trainer: Trainer, carry: Carry, stop: Callable[[], bool] = lambda: False
-) -> Iterator[tuple[int, Carry, dict[str, np.ndarray]]]:
-    """Iterate to the end or until `stop()`; yields (iterations done, carry, what the log wants).
+) -> Iterator[tuple[int, Carry, Told]]:
+    """Iterate to the end or until `stop()`; yields (iterations done, carry, what it tells).
 
-    The arrays of `carry` have a leading axis of runs where there are several; those of the log
+    The arrays of `carry` have a leading axis of runs where there are several; those of `Told`
     always have it. The carry that goes in is used up.
     """
     done, mesh = int(np.min(carry.iteration)), devices.mesh_for(carry.iteration.size)
@@ -153,11 +162,12 @@ def advance(
         with devices.using(mesh):
             iterate = iterate or compiled(_iterate)
             carry, info = iterate(carry)
+            log, health = info["log"], info["health"]
             if done % trainer.schedule.judge_every == 0 or done == trainer.iterations:
                 judge = judge or compiled(_judge)
                 carry, look = judge(carry)
-                info |= look
-        yield done, carry, jax.tree.map(np.atleast_1d, info)
+                log |= look
+        yield done, carry, Told(*jax.tree.map(np.atleast_1d, (log, Health(**health))))
 
 
 @dataclass(frozen=True)
@@ -229,12 +239,12 @@ def train(
         yield events.Started("", seed)
         clock = time.monotonic()
         first = _stack([begin(trainer, seed)])
-        for done, carry, rows in advance(trainer, first):
+        for done, carry, told in advance(trainer, first):
             last[:] = [carry]
-            line = _line(trainer, seed, done, time.monotonic() - clock, rows, 0)
-            if fault := _fault(line):
-                raise Diverged(_advice(fault, line, game.agents) + ".")
-            history.append(_told(line))
+            line = _line(trainer, seed, done, time.monotonic() - clock, told.log, 0)
+            if fault := _fault(line, told.health_of(0), game.agents):
+                raise Diverged(f"{fault.says()}.")
+            history.append(line)
             if on_iteration:
                 on_iteration(history[-1])
             yield events.Progress("", seed, history[-1], trainer.iterations)
@@ -245,9 +255,8 @@ def train(
         for _ in happening():
             pass
     carry = _row(last[0], 0)
-    return Trained(
-        carry.best, algorithm.lyapunov(carry.learner), game, history, trainer, seed, carry
-    )
+    lyapunov = algorithm.lyapunov(algorithm.networks(carry.learner))
+    return Trained(carry.best, lyapunov, game, history, trainer, seed, carry)
 
 
 class _Saved:
@@ -309,7 +318,11 @@ def _each(
 
 
 def _iterate(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
-    return _each(trainer.iterate, carry)
+    def told(carry):
+        after, info = trainer.iterate(carry)
+        return after, {"log": info.log, "health": info.health._asdict()}
+
+    return _each(told, carry)
 
 
 def _judge(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
@@ -317,7 +330,7 @@ def _judge(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
 
 
 def _line(
-    trainer: Trainer, seed: int, done: int, seconds: float, rows: dict[str, np.ndarray], i: int
+    trainer: Trainer, seed: int, done: int, seconds: float, log: dict[str, np.ndarray], i: int
 ) -> dict[str, Any]:
     """One line of the log."""
     return {
@@ -326,34 +339,32 @@ def _line(
         "steps": done * trainer.steps_per_iteration,
         "updates": done * trainer.updates_per_iteration,
         "seconds": round(seconds, 3),
-    } | {name: float(values[i]) for name, values in rows.items()}
+    } | {name: float(values[i]) for name, values in log.items()}
 
 
-def _told(line: dict[str, Any]) -> dict[str, Any]:
-    """The line without the fields that find faults: there was none, or training had stopped."""
-    return {k: v for k, v in line.items() if not k.startswith("bad_") or v >= 0}
+class _Fault(NamedTuple):
+    """What stopped a run, and when."""
+
+    name: str  # a kind of number, or a figure of the log
+    when: str
+    by_task: TaskFault | None  # None where training made it
+
+    def says(self, where: str | None = None) -> str:
+        """The fault and its remedy; `where` it was found first, if that is known."""
+        if self.by_task:
+            return f"{self.by_task.says(self.when)} and resume from the last checkpoint"
+        first = f", first in {where}" if where else ""
+        return (
+            f"{self.name}: training made a number that is not finite {self.when}{first}; lower "
+            "the learning rates and resume from the last checkpoint"
+        )
 
 
-def _fault(line: dict[str, Any]) -> str | None:
+def _fault(line: dict[str, Any], health: Health, agents: int) -> _Fault | None:
     """What is wrong: what the task gave before what the algorithm made of it."""
-    for name in BY_TASK:
-        if line.get(name, -1) >= 0:
-            return name.removeprefix("bad_")
+    when = f"in iteration {line['iteration']} (seed {line['seed']})"
+    if by_task := health.by_task(agents):
+        return _Fault(by_task.name, when, by_task)
     losses = (name for name, value in line.items() if not np.isfinite(value))
-    others = (name for name in ("action", "learner") if line.get(f"bad_{name}", -1) >= 0)
-    return next(chain(losses, others), None)
-
-
-def _advice(fault: str, line: dict[str, Any], agents: int, where: str | None = None) -> str:
-    by_task, what = f"bad_{fault}" in BY_TASK, "a number that is not finite"
-    if fault == "sign":
-        what = "a negative number"
-    text = f"{'cost' if fault == 'sign' else fault}: "
-    text += f"{'the task returned' if by_task else 'training made'} {what} "
-    text += f"in iteration {line['iteration']} (seed {line['seed']})"
-    if by_task:
-        step, agent = divmod(int(line[f"bad_{fault}"]), agents)
-        text += f", first for agent {agent} at step {step}"
-    text += f", first in {where}" if where else ""
-    remedy = "correct the task" if by_task else "lower the learning rates"
-    return f"{text}; {remedy} and resume from the last checkpoint"
+    name = next(losses, health.by_training())
+    return _Fault(name, when, None) if name else None

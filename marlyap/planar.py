@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from marlyap.dynamics import AbstractDynamics, Independent
-from marlyap.errors import UserError
+from marlyap.errors import UserError, whole_fields
 from marlyap.game import AbstractRegulation, Tolerance
 from marlyap.sensing import body_frame, body_frame_entries, into_frame, near
 from marlyap.types import Entry, Links, Obs, Scene, State
@@ -33,6 +33,7 @@ class AbstractPlanar(AbstractRegulation):
     dynamics: eqx.AbstractVar[AbstractDynamics]
 
     def __check_init__(self):
+        whole_fields(self)
         n = self.agents
         if not 0 < self.radius < 1e6:
             raise UserError(f"radius: {self.radius} m must be a positive distance in metres.")

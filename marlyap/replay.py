@@ -4,6 +4,8 @@ Whole episodes are kept because next_obs of one step is obs of the following one
 memory), and because n-step returns need the steps that follow.
 """
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -24,6 +26,11 @@ class Episode(eqx.Module):
     cost_to_go: Float[Array, "time agent"]
     cost_ahead: Float[Array, "time agent"]
     terminated: Bool[Array, "time"]
+
+    @property
+    def steps(self) -> int:
+        """Of all episodes together, where there is a leading axis `episode`."""
+        return math.prod(self.terminated.shape)
 
 
 class Replay(eqx.Module):

@@ -26,14 +26,15 @@ from marlyap.algorithm import AbstractAlgorithm
 from marlyap.conformance import shapes
 from marlyap.errors import UserError, defined_at
 from marlyap.game import AbstractGame
+from marlyap.health import Health
 from marlyap.nets import LyapunovNet, NormNet
-from marlyap.rollout import Decentralised, Policy, first_fault
-from marlyap.trainer import Carry, Schedule, Trainer, first_negative, shape
+from marlyap.rollout import Decentralised, Policy
+from marlyap.schedule import Schedule
+from marlyap.source import shape
+from marlyap.trainer import Carry, Trainer
 
 
-SCHEMA = 1
-NEGATIVE = "negative cost"
-FROM_TASK = ("obs", "features", "reward", "cost")  # numbers that the task answers for
+SCHEMA = 2
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,8 @@ class Run:
             raise UserError(f"run: {where} lacks some of its fields; use another copy of this run.")
         if about["schema"] != SCHEMA:
             raise UserError(
-                f"run: {where} has schema {about['schema']}, this marlyap reads {SCHEMA}."
+                f"run: {where} has schema {about['schema']}, this marlyap reads {SCHEMA}; train it "
+                "again, or open it with the marlyap that made it."
             )
         if type(about["seed"]) is not int or not isinstance(about["names"], dict):
             raise UserError(f"run: {where} has a seed or names of the wrong kind.")
@@ -212,23 +214,24 @@ class Run:
         return self.steps_done >= self.trainer.iterations * self.trainer.steps_per_iteration
 
     def save(self, carry: Carry, seconds: float) -> None:
-        """Checkpoint everything, and hand out the best policy with its Lyapunov function."""
+        """Checkpoint everything, and store the best policy with its Lyapunov function."""
         self.checkpoints.save(int(carry.iteration), flatten(carry), {"seconds": seconds})
-        handed = (carry.best, self.trainer.algorithm.lyapunov(carry.learner))
+        a = self.trainer.algorithm
+        deployed = (carry.best, a.lyapunov(a.networks(carry.learner)))
         meta = {"seed": self.seed, "iteration": int(carry.iteration), "score": float(carry.score)}
-        store.write(self.directory / "policy", "policy", flatten(handed), meta, replace=True)
+        store.write(self.directory / "policy", "policy", flatten(deployed), meta, replace=True)
 
     def load(self) -> tuple[Carry, float, tuple[str, ...]]:
         """The newest sound checkpoint, the seconds spent until then, and warnings."""
         if not self.checkpoints.steps():
             return begin(self.trainer, self.seed), 0.0, ()
         saved = self.checkpoints.latest()
-        like = eqx.filter_eval_shape(self.trainer.begin, jax.random.key(0))
+        like, _ = eqx.filter_eval_shape(self.trainer.begin, jax.random.key(0))
         carry = unflatten(like, saved.arrays, str(self.directory))
         return carry, float(saved.meta.get("seconds", 0.0)), saved.warnings
 
-    def handed_out(self) -> tuple[Policy, LyapunovNet | NormNet | None]:
-        """The policy that this run hands out, and its Lyapunov function if it has one."""
+    def deployed(self) -> tuple[Policy, LyapunovNet | NormNet | None]:
+        """The policy that this run deploys, and its Lyapunov function if it has one."""
         place = self.directory / "policy"
         if not place.is_dir():
             raise UserError(f"run: {self.directory} has no policy yet; train it first.")
@@ -236,8 +239,8 @@ class Run:
         a = self.trainer.algorithm
 
         def made(key):
-            learner = a.init(shape(self.game), key)
-            return a.exploit(learner), a.lyapunov(learner)
+            networks = a.init(shape(self.game), key)
+            return a.policy(networks), a.lyapunov(networks)
 
         like = eqx.filter_eval_shape(made, jax.random.key(0))
         return unflatten(like, arrays, str(place))
@@ -248,7 +251,7 @@ class Run:
         Raises UserError if it takes other observations, or has other agents' weights.
         """
         there = self.game if game is None else game
-        policy = self.handed_out()[0]
+        policy = self.deployed()[0]
         if game is not None and not _fits(policy, game):
             was, new = shape(self.game), shape(game)
             raise UserError(
@@ -298,26 +301,22 @@ def _fits(policy: Policy, game: AbstractGame) -> bool:
 
 
 def begin(trainer: Trainer, seed: int) -> Carry:
-    """The state of a fresh run. Raises UserError if the warm-up was not played in numbers."""
+    """The state of a fresh run. Raises UserError if what it began with was not played in numbers.
+
+    In numbers: all are finite, and no cost is negative.
+    """
     key = seeds.stream(seed, "train")
-    like = lambda: eqx.filter_eval_shape(trainer.begin, key)
-    carry, faults = programs.compiled(_begin, trainer, key, like)(key)
-    for name, at in faults.items():
-        if int(at) >= 0:
-            step, agent = divmod(int(at), trainer.game.agents)
-            what = "a negative number" if name == NEGATIVE else "a number that is not finite"
-            raise UserError(
-                f"{name.split()[-1]}: the task returned {what} in the warm-up (seed {seed}), first "
-                f"for agent {agent} at step {step}; correct the task (check-task says more)."
-            )
+    like = lambda: eqx.filter_eval_shape(trainer.begin, key)[0]
+    carry, health = programs.compiled(_begin, trainer, key, like)(key)
+    if fault := Health(**health).by_task(trainer.game.agents):
+        when = f"in the warm-up (seed {seed})"
+        raise UserError(f"{fault.says(when)} (check-task says more).")
     return carry
 
 
 def _begin(trainer: Trainer, key: jax.Array) -> tuple[Carry, dict[str, Any]]:
-    carry = trainer.begin(key)
-    played = carry.memory.episodes
-    faults = {name: first_fault(getattr(played, name)) for name in FROM_TASK}
-    return carry, faults | {NEGATIVE: first_negative(played.cost)}
+    carry, health = trainer.begin(key)
+    return carry, health._asdict()
 
 
 def sound(game: AbstractGame) -> None:

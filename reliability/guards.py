@@ -20,7 +20,7 @@ class Guard(NamedTuple):
     test: str
 
 
-STORE, FIT = "marlyap/store.py", "marlyap/fit.py"
+STORE, FIT, HEALTH = "marlyap/store.py", "marlyap/fit.py", "marlyap/health.py"
 HASH = ('if _sha256([data]) != facts["sha256"]:', "if False:")
 GUARDS = [
     Guard(
@@ -159,8 +159,8 @@ GUARDS = [
     ),
     Guard(
         "20 not finite: found and named",
-        FIT,
-        (("    for name in BY_TASK:\n        if line", "    for name in ():\n        if line"),),
+        HEALTH,
+        (('for name in ("obs", "features", "reward", "cost", "negative"):', "for name in ():"),),
         "tests/test_resume.py::test_the_agent_and_the_step_of_a_bad_reward_are_named",
     ),
     Guard(
@@ -174,8 +174,8 @@ GUARDS = [
         FIT,
         (
             (
-                "            fault = _fault(line)\n            if fault and",
-                "            fault = None\n            if fault and",
+                "told.health_of(i), trainer.game.agents)\n            if fault and",
+                "told.health_of(i), trainer.game.agents) and None\n            if fault and",
             ),
         ),
         "tests/test_resume.py::test_when_all_diverge_training_stops_and_the_checkpoints_stay",

@@ -47,8 +47,8 @@ from marlyap.nets import Actors, Greedy
 from marlyap.planar import AbstractPlanar, Goals
 from marlyap.recheck import recheck
 from marlyap.rollout import Decentralised
+from marlyap.source import shape
 from marlyap.tasks import Formation, Rendezvous
-from marlyap.trainer import shape
 from marlyap.types import State
 
 

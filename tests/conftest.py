@@ -92,6 +92,17 @@ def filled(make, *args, seed=0):
     return jax.tree.map(fill, eqx.filter_eval_shape(make, *args))
 
 
+def shrunk(algorithm, **sizes):
+    """The algorithm with those of these fields that it has, or that the one it wraps has."""
+    import dataclasses
+
+    if hasattr(algorithm, "sac"):
+        return dataclasses.replace(algorithm, sac=shrunk(algorithm.sac, **sizes))
+    return dataclasses.replace(
+        algorithm, **{field: n for field, n in sizes.items() if hasattr(algorithm, field)}
+    )
+
+
 def same(a, b):
     """Whether two trees are equal to the last bit, shapes and types included."""
     raw = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
@@ -182,16 +193,16 @@ def learner(masac, shape, batch):
     """Its learner in mid-training: targets lag, norms and temperature have moved; Adam is fresh."""
     import equinox as eqx
 
-    from marlyap.learn import Learnt
+    from marlyap.optimiser import TrainState
 
     l = filled(masac.init, shape, jax.random.key(0))
     number = lambda x: jnp.asarray(x, jnp.float32)
-    fresh = lambda learnt: Learnt.of(learnt.value)
+    fresh = lambda learnt: TrainState.of(learnt.value)
     L = l.L
     L = eqx.tree_at(
         lambda L: (L.net, L.log_weight, L.gradient, L.scale),
         L,
-        (fresh(L.net), Learnt.of(number(np.log(0.3))), number(0.8), number(1.7)),
+        (fresh(L.net), TrainState.of(number(np.log(0.3))), number(0.8), number(1.7)),
     )
     l = eqx.tree_at(lambda l: l.Q_bar, l, level(l.Q_bar, batch.next_features, batch.action))
     return eqx.tree_at(
@@ -199,8 +210,8 @@ def learner(masac, shape, batch):
         l,
         (
             fresh(l.pi),
-            Learnt.of(level(l.Q.value, batch.features, batch.action)),
-            Learnt.of(number(-1.2)),
+            TrainState.of(level(l.Q.value, batch.features, batch.action)),
+            TrainState.of(number(-1.2)),
             L,
         ),
     )

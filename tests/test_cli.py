@@ -336,6 +336,7 @@ SPOILT = {
     "of another program": (lambda a: '{"name": "x", "version": 3}', ["lacks some of its fields"]),
     "without its task": (drop("task"), ["lacks some of its fields"]),
     "newer": (put("schema", 99), ["schema 99"]),
+    "older": (put("schema", 1), ["schema 1", "train it again"]),
     "seed of the wrong kind": (put("seed", "0"), ["seed or names of the wrong kind"]),
     "names of the wrong kind": (put("names", []), ["seed or names of the wrong kind"]),
     "unknown task": (put("task.kind", "Mine"), ["task: 'Mine'", "--task path/to/file.py:Mine"]),
@@ -483,7 +484,7 @@ def test_nan_from_a_users_task_is_named_and_the_last_checkpoint_is_intact(
     assert saved.step == at - 1 and saved.warnings == ()
     numbers = [x for x in saved.arrays.values() if x.dtype.kind == "f"]
     assert numbers and all(np.isfinite(x).all() for x in numbers)
-    leaves = jax.tree.leaves(opened.handed_out()[0])
+    leaves = jax.tree.leaves(opened.deployed()[0])
     assert all(jnp.isfinite(x).all() for x in leaves if isinstance(x, jax.Array))
 
     before = contents(run)

@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 
 from marlyap import config
 from marlyap.algorithm import AbstractAlgorithm
-from marlyap.algorithms import ALGORITHMS, MASAC, PRESETS
+from marlyap.algorithms import ALGORITHMS, MASAC, PRESETS, DecentralisedSAC
 from marlyap.constraint import Unconstrained
 from marlyap.constraints import CONSTRAINTS, Lyapunov
 from marlyap.dynamics import DYNAMICS, DoubleIntegrator, Unicycle
@@ -20,7 +20,7 @@ from marlyap.tasks import TASKS, Rendezvous
 from marlyap.trainer import SCHEDULES, Schedule, Trainer
 
 
-GAME, RULE = Rendezvous(), MASAC(constraint=Lyapunov())
+GAME, RULE, ALONE = Rendezvous(), MASAC(constraint=Lyapunov()), DecentralisedSAC()
 
 
 def refused(run, *parts):
@@ -57,6 +57,8 @@ def refused(run, *parts):
         (RULE, "gamma", "0.9", 0.9),
         (RULE, "constraint", "none", Unconstrained()),
         (RULE, "constraint.reading", "hinge", "hinge"),
+        (ALONE, "sac", "masac-nstep", MASAC(n_step=5)),
+        (ALONE, "sac.constraint", "none", Unconstrained()),
         (RULE, "constraint.weight", "0.5", 0.5),
         (RULE, "constraint.weight", "none", None),
         (RULE, "constraint.slope", "empirical", "empirical"),
@@ -141,7 +143,7 @@ def test_what_cannot_be_set_is_said_in_one_sentence(of, path, text, parts):
         (RULE, "alpha", "0"),
         (RULE, "actor_width", "0"),
         (RULE, "critic_width", "-8"),
-        (RULE, "average", "0"),
+        (RULE, "ema_rate", "0"),
         (RULE, "constraint.weight_start", "0"),
         (RULE, "constraint.floor", "0"),
         (RULE, "constraint.discount", "2"),

@@ -48,7 +48,7 @@ trainer = Trainer(Rendezvous(horizon=2), algorithm, plan)
 def trained(folder):
     runs = [Run.create(folder / str(s), trainer, s, {}) for s in (0, 1)]
     log = list(fit(runs))
-    policies = [flatten(run.handed_out()) for run in runs]
+    policies = [flatten(run.deployed()) for run in runs]
     carries = [flatten(run.load()[0]) for run in runs]
     return log, policies, carries
 

@@ -38,10 +38,15 @@ FLOORS = """
     perturb
     rollout
     replay
+    health
     layout
     nets
-    learn
+    schedule
+    source
+    optimiser
     algorithm
+    off_policy
+    on_policy
     constraint
     constraints
     algorithms

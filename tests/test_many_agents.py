@@ -10,7 +10,7 @@ import pytest
 from conftest import close, filled
 from test_paper import mlp, rows, xs
 
-from marlyap import learn
+from marlyap import optimiser
 from marlyap.algorithms.masac import MASAC
 from marlyap.constraints.lyapunov import Lyapunov
 from marlyap.errors import UserError
@@ -73,22 +73,22 @@ def test_the_same_weights_serve_any_number_of_agents(shape):
 
 def test_a_batch_in_parts_descends_as_the_whole(monkeypatch):
     """Large teams take a batch in parts, so that what it passes through stays in the cache."""
-    assert [learn.parts(256, n) for n in (3, 8, 16, 32, 128, 1000)] == [1, 1, 8, 16, 64, 256]
-    assert learn.parts(7, 1000) == 7 and learn.parts(250, 10) == 5
+    assert [optimiser.parts(256, n) for n in (3, 8, 16, 32, 128, 1000)] == [1, 1, 8, 16, 64, 256]
+    assert optimiser.parts(7, 1000) == 7 and optimiser.parts(250, 10) == 5
     game = Rendezvous(agents=3, horizon=4)
     algorithm = MASAC(**TINY, shared=True, critic="mean-field", constraint=Lyapunov(horizon=2))
     trainer = Trainer(game, algorithm, Schedule(steps=16, environments=2, warmup=8))
-    monkeypatch.setattr(learn, "PART", 6)  # two transitions of three agents
+    monkeypatch.setattr(optimiser, "PART", 6)  # two transitions of three agents
 
     def updated(whole):
-        monkeypatch.setattr(learn, "WHOLE", whole)
-        assert learn.parts(algorithm.batch, game.agents) == (1 if whole > 1 else 4)
+        monkeypatch.setattr(optimiser, "WHOLE", whole)
+        assert optimiser.parts(algorithm.batch, game.agents) == (1 if whole > 1 else 4)
 
         @eqx.filter_jit
         def update(key):
-            carry = trainer.begin(key)
-            batch = carry.memory.sample(key, algorithm.batch, algorithm.gamma)
-            return algorithm.update(carry.learner, batch, jnp.ones(()))
+            learner = trainer.begin(key)[0].learner
+            batch = learner.memory.sample(key, algorithm.batch, algorithm.gamma)
+            return algorithm.update(learner.networks, batch, jnp.ones(()))
 
         return update(KEY)
 
@@ -102,9 +102,9 @@ def work(agents):
     trainer = Trainer(game, algorithm, Schedule(steps=40, environments=1, warmup=40))
 
     def update(key):
-        carry = trainer.begin(key)
-        batch = carry.memory.sample(key, algorithm.batch, algorithm.gamma)
-        return batch, carry.learner
+        learner = trainer.begin(key)[0].learner
+        batch = learner.memory.sample(key, algorithm.batch, algorithm.gamma)
+        return batch, learner.networks
 
     batch, learner = eqx.filter_eval_shape(update, KEY)
     dynamic, static = eqx.partition(learner, lambda x: isinstance(x, jax.ShapeDtypeStruct))
@@ -117,7 +117,7 @@ def work(agents):
 
 
 def test_work_grows_no_faster_than_the_number_of_agents(monkeypatch):
-    monkeypatch.setattr(learn, "WHOLE", 10**6)  # a loop's body counts once
+    monkeypatch.setattr(optimiser, "WHOLE", 10**6)  # a loop's body counts once
     few, many = work(8), work(32)
     assert 2 < many / few < 1.05 * 32 / 8
 
@@ -140,7 +140,7 @@ def run(tmp_path_factory):
 def test_a_policy_runs_with_another_number_of_agents(run, agents):
     """What an agent does depends on what it sees alone, not on how many others there are."""
     game = replace(run.game, agents=agents)
-    controller, (policy, _) = run.controller(game), run.handed_out()
+    controller, (policy, _) = run.controller(game), run.deployed()
 
     @jax.jit
     def act(key):

@@ -18,8 +18,10 @@ from marlyap.constraints import Lyapunov
 from marlyap.dynamics import SingleIntegrator
 from marlyap.errors import UserError
 from marlyap.run import Run, flatten
+from marlyap.schedule import Schedule
+from marlyap.source import shape
 from marlyap.tasks import Rendezvous
-from marlyap.trainer import Schedule, Trainer, shape
+from marlyap.trainer import Trainer
 
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -35,7 +37,7 @@ def untrained(place, seed=0, **fields):
     names = {"task": "own/path/to/tasks.py:Meet", "algorithm": "masac-lyapunov", "preset": "tuned"}
     run = Run.create(place, Trainer(GAME, rule, plan), seed, names)
     learner = rule.init(shape(GAME), jax.random.key(seed))
-    handed = rule.exploit(learner), rule.lyapunov(learner)
+    handed = rule.policy(learner), rule.lyapunov(learner)
     store.write(place / "policy", "policy", flatten(handed), {"iteration": 2})
     for k in (1, 2):
         run.log({"iteration": k, "steps": 8 * k, "return": -2.0, "success": 0.1, "seconds": 1.0})

@@ -102,7 +102,7 @@ class Own(Rendezvous):
         return jnp.full((self.agents, 2), 0.01)
 
     def at_target(self, state):
-        return eqx.tree_at(lambda s: s.x, state, state.scenario.goal + 0.0)
+        return eqx.tree_at(lambda s: s.x, state, self.goals(state))
 
     def goals(self, state):
         return state.scenario.goal + 0.02
@@ -256,14 +256,14 @@ def test_training_plays_and_selects_by_what_the_game_says():
         steps=48, environments=4, steps_per_update=24, warmup=24, judge_every=1, judge_episodes=16
     )
     trainer = Trainer(GAME, MASAC(actor_width=8, critic_width=8, batch=8), schedule)
-    carry = eqx.filter_jit(trainer.begin)(jax.random.key(0))
-    kept = carry.memory.episodes
+    carry, _ = eqx.filter_jit(trainer.begin)(jax.random.key(0))
+    kept = carry.learner.memory.episodes
     obs = np.asarray(kept.obs)[0]
     assert obs.shape[-1] == GAME.observations(GAME.reset(KEYS[0])).shape[1]
     assert np.allclose(obs[1, :, -2:], np.asarray(kept.action)[0, 0], atol=1e-6)  # its memory
     assert np.allclose(np.asarray(kept.reward)[:4], 1 - np.asarray(kept.cost)[:4], atol=1e-5)
     _, look = eqx.filter_jit(trainer.judge)(carry)
-    policy = trainer.algorithm.exploit(carry.learner)
+    policy = trainer.algorithm.policy(carry.learner.networks)
     keys = jax.random.split(stream(0, "select"), 16)
     found = outcomes(GAME, Decentralised(policy, GAME), keys)
     assert float(look["success"]) == pytest.approx(float(np.mean(found.success)))

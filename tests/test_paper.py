@@ -17,10 +17,11 @@ from scipy import stats
 
 from marlyap.algorithms import MASAC
 from marlyap.constraint import Unconstrained
-from marlyap.constraints.lyapunov import Certificate, Lyapunov, distance
+from marlyap.constraints.lyapunov import LearnedLyapunov, Lyapunov
+from marlyap.constraints.readings import distance
 from marlyap.errors import UserError
-from marlyap.learn import Learnt, polyak
 from marlyap.nets import MLP, Actors, Critic, Greedy, LyapunovNet, NormNet, Sampled, Shape
+from marlyap.optimiser import TrainState, polyak
 from marlyap.rollout import Decentralised, cost_to_go, rollout
 from marlyap.tasks import TASKS
 from marlyap.trainer import Schedule, Trainer
@@ -224,7 +225,7 @@ def with_heads(request, masac, learner, batch, shape):
     now = level(critic(7), batch.features, batch.action)
     slow = level(critic(8), batch.next_features, batch.action)
     several = eqx.tree_at(lambda l: (l.Q.value, l.Q_bar), learner, (now, slow))
-    return replace(masac, heads="agent", keep_Q=True), several
+    return replace(masac, heads="agent", use_Q=True), several
 
 
 def test_J_Q_and_J_pi_and_J_alpha(with_heads, batch, drawn):
@@ -257,7 +258,7 @@ def test_J_Q_and_J_pi_and_J_alpha(with_heads, batch, drawn):
 
 
 def test_dropping_Q_leaves_entropy_and_constraint(masac, learner, batch, drawn):
-    without = objectives(replace(masac, keep_Q=False), learner, batch, *drawn)[1]
+    without = objectives(replace(masac, use_Q=False), learner, batch, *drawn)[1]
     now, nxt = drawn
     penalty = penalties(masac.constraint, learner.L, batch, now, nxt)
     alpha = jnp.exp(learner.log_alpha.value)
@@ -342,7 +343,7 @@ def test_slow_copies_follow(masac, learner, updated):
     floats = lambda tree: eqx.filter(tree, eqx.is_inexact_array)
     for tau, new, old, got in (
         (masac.tau, updated.Q.value, learner.Q_bar, updated.Q_bar),
-        (masac.average, updated.pi.value, learner.pi_mean, updated.pi_mean),
+        (masac.ema_rate, updated.pi.value, learner.pi_mean, updated.pi_mean),
         (masac.constraint.tau, updated.L.net.value, learner.L.net_bar, updated.L.net_bar),
     ):
         close(floats(got), mix(tau, floats(new), floats(old)), rtol=1e-6, atol=1e-7)
@@ -424,7 +425,7 @@ OPEN = {  # field: what is just allowed, and what is just not
     MASAC: {
         "gamma": ([0.0, 1.0], [-1e-9, 1.000001]),
         "tau": ([1e-9, 1.0], [0.0, 1.000001]),
-        "average": ([1e-9, 1.0], [0.0, 1.000001]),
+        "ema_rate": ([1e-9, 1.0], [0.0, 1.000001]),
         "rate_pi": ([0.0, 1.0], [-1e-9, 1.000001]),
         "rate_Q": ([0.0, 1.0], [-1e-9, 1.000001]),
         "rate_alpha": ([0.0, 1.0], [-1e-9, 1.000001]),
@@ -495,7 +496,7 @@ def test_weight_zero_is_plain_masac(masac, learner, batch):
 def test_adam_is_adam():
     rng = np.random.default_rng(0)
     theta = {"a": jnp.asarray(rng.standard_normal((2, 3)), jnp.float32), "b": jnp.ones(2)}
-    ours, reference = Learnt.of(theta), optax.adam(3e-3)
+    ours, reference = TrainState.of(theta), optax.adam(3e-3)
     value, state = theta, reference.init(theta)
     m = v = 0.0
     a = np.asarray(theta["a"], float)
@@ -512,7 +513,7 @@ def test_adam_is_adam():
 
 def test_policies_of_a_learner(masac, learner, batch):
     """What explores is pi; what is handed out is its running mean, without noise."""
-    explorer, policy = masac.explore(learner), masac.exploit(learner)
+    explorer, policy = masac.explore(learner), masac.policy(learner)
     assert isinstance(explorer, Sampled) and isinstance(policy, Greedy)
     run = eqx.filter_jit(lambda p, obs, key: p(obs, key))
     obs, keys = batch.obs[0], jax.random.split(KEY, 2)
@@ -565,7 +566,7 @@ def certificate(learner, shape):
     L = learner.L
     return {
         "squares": L,
-        "norm": Certificate(Learnt.of(norm), lag, L.log_weight, L.gradient, L.scale),
+        "norm": LearnedLyapunov(TrainState.of(norm), lag, L.log_weight, L.gradient, L.scale),
     }
 
 
@@ -773,7 +774,7 @@ def targets(constraint, L, batch, nxt):
 @pytest.mark.parametrize("target", ["rollout", "hold_last", "bootstrap", "discounted"])
 def test_L_target(target, certificate, batch, drawn):
     constraint, L = Lyapunov(target=target, discount=0.9), certificate["squares"]
-    assert constraint.foresight == (10, target == "rollout")
+    assert constraint.cost_window == (10, target == "rollout")
     got, J_L = targets(constraint, L, batch, drawn[1])
     for k, (b, n) in enumerate(zip(rows(batch), rows(drawn[1]), strict=True)):
         slow = lyapunov(L.net_bar, b.next_features, n.action)  # not the fast one
@@ -803,7 +804,7 @@ def seen(game):
         game, Decentralised(Greedy(pi), game), game.reset(key), key, 60))  # fmt: skip
     table = filled(lambda k: Table(shape, key=k), KEY)
     one = jnp.ones(())
-    L = Certificate(Learnt(table, None), table, Learnt.of(0 * one), one, one)
+    L = LearnedLyapunov(TrainState(table, None), table, TrainState.of(0 * one), one, one)
     return play(pi, KEY).cost, L
 
 

@@ -14,7 +14,7 @@ import pytest
 
 import marlyap
 from marlyap import programs, provenance
-from marlyap.learn import Learnt
+from marlyap.optimiser import TrainState
 from marlyap.store import MANIFEST, PAYLOAD
 from marlyap.tasks import TASKS
 
@@ -29,7 +29,7 @@ def remember(game, carry):
     (total, name), key = carry.value, carry.memory
     key, now = jax.random.split(key)
     cost = game.costs(game.reset(now), jnp.zeros((game.agents, game.dynamics.du)))
-    return Learnt((total + jnp.sum(cost), name), key), {"cost": jnp.mean(cost)}
+    return TrainState((total + jnp.sum(cost), name), key), {"cost": jnp.mean(cost)}
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def folder(tmp_path, monkeypatch):
 
 def start(shape=(3,), name="started"):
     """What a training carries, in small: an array, a random key, and what is neither."""
-    return Learnt((jnp.zeros(shape), name), jax.random.key(7))
+    return TrainState((jnp.zeros(shape), name), jax.random.key(7))
 
 
 def compiled(game=GAME, memory=start, f=remember, **more):
@@ -64,7 +64,7 @@ def test_a_second_start_traces_nothing_and_computes_the_same(folder, monkeypatch
     plain, cost_plain = compiled()(start())
     assert len(TRACES) == 2
     assert same((first, cost), (again, cost_again)) and same((first, cost), (plain, cost_plain))
-    assert first.value[1] == again.value[1] == "started" and isinstance(again, Learnt)
+    assert first.value[1] == again.value[1] == "started" and isinstance(again, TrainState)
     onwards = compiled()
     assert not same(onwards(onwards(start())[0]), (first, cost))  # the key has moved on
 

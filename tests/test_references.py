@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import filled, same
+from conftest import filled, same, shrunk
 from scipy import stats
 
 from marlyap import store
@@ -15,11 +15,13 @@ from marlyap.algorithms import ALGORITHMS, MADDPG, MASAC, PRESETS, CentralisedSA
 from marlyap.algorithms.sac import alone, joint
 from marlyap.constraints import Lyapunov
 from marlyap.errors import UserError
-from marlyap.learn import Learnt
 from marlyap.nets import Actors, Noisy, Sample
+from marlyap.optimiser import TrainState
 from marlyap.run import Run, flatten
+from marlyap.schedule import Schedule
+from marlyap.source import shape as nets_shape
 from marlyap.tasks.rendezvous import Rendezvous
-from marlyap.trainer import Schedule, Trainer, shape as nets_shape
+from marlyap.trainer import Trainer
 
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -41,13 +43,12 @@ LIKE_THEM = (pytest.param(name, marks=pytest.mark.slow) for name in sorted({*ALG
 def test_what_is_handed_out_is_read_back(name, tmp_path):
     """The policy of a run is rebuilt from shapes alone before its arrays are read."""
     algorithm = ALGORITHMS[name]
-    small = {k: 4 for k in ("actor_width", "critic_width") if hasattr(algorithm, k)}
-    algorithm, game = dataclasses.replace(algorithm, **small), Rendezvous(horizon=40)
+    algorithm, game = shrunk(algorithm, actor_width=4, critic_width=4), Rendezvous(horizon=40)
     run = Run.create(tmp_path / "run", Trainer(game, algorithm, Schedule()), 0, {})
     learner = eqx.filter_jit(algorithm.init)(nets_shape(game), KEY)
-    handed = (algorithm.exploit(learner), algorithm.lyapunov(learner))
+    handed = (algorithm.policy(learner), algorithm.lyapunov(learner))
     store.write(run.directory / "policy", "policy", flatten(handed), {})
-    assert eqx.tree_equal(run.handed_out(), handed)
+    assert eqx.tree_equal(run.deployed(), handed)
     action = run.controller().policy(jnp.zeros((3, nets_shape(game).obs)), KEY)
     assert action.shape == (3, 2)
 
@@ -63,7 +64,7 @@ def test_alone_an_agent_has_its_own_row_and_observes_the_state(batch):
 
 
 def test_decentralised_agents_learn_nothing_from_each_other(shape, batch):
-    rule = DecentralisedSAC(**SMALL)
+    rule = DecentralisedSAC(MASAC(**SMALL))
     learner = eqx.filter_jit(rule.init)(shape, KEY)
     fields = ("obs", "features", "action", "reward", "next_obs", "next_features")
     change = lambda x: x.at[:, 2].multiply(0.5)
@@ -77,7 +78,7 @@ def test_decentralised_agents_learn_nothing_from_each_other(shape, batch):
     assert not same(at(a, 2).Q.value, at(b, 2).Q.value)
     assert not same(at(a, 0).Q.value, at(learner, 0).Q.value)
     # Together they are one decentralised policy: to each agent its own actor.
-    policy = rule.exploit(a)
+    policy = rule.policy(a)
     got = policy(batch.obs[0], KEY)
     for i in range(3):
         np.testing.assert_allclose(got[i : i + 1], at(a, i).pi_mean.mode(batch.obs[0, i : i + 1]))
@@ -87,9 +88,9 @@ def test_decentralised_agents_learn_nothing_from_each_other(shape, batch):
 def test_centralised_agents_see_everything(shape, batch):
     obs = batch.obs[0]
     np.testing.assert_array_equal(joint(obs), np.tile(np.ravel(obs), (3, 1)))
-    rule = CentralisedSAC(**SMALL)
+    rule = CentralisedSAC(MASAC(**SMALL))
     learner = filled(rule.init, shape, KEY)
-    for policy in (rule.exploit(learner), rule.explore(learner)):
+    for policy in (rule.policy(learner), rule.explore(learner)):
         moved = policy(obs.at[2].add(1.0), KEY) != policy(obs, KEY)
         assert np.all(np.any(moved, axis=1))
     explorer = rule.explore(learner)
@@ -113,7 +114,7 @@ def test_the_target_of_deterministic_critics(shape, batch, critics):
 def test_matd3_moves_its_actors_every_second_time(shape, batch):
     rule = dataclasses.replace(ALGORITHMS["matd3"], **SMALL)
     l = filled(rule.init, shape, KEY)
-    fresh = lambda learnt: Learnt.of(learnt.value)
+    fresh = lambda learnt: TrainState.of(learnt.value)
     l = eqx.tree_at(lambda l: (l.pi, l.Q), l, (fresh(l.pi), fresh(l.Q)))
     once = step(rule, l, batch)
     slow = lambda l: (l.pi, l.pi_bar, l.pi_mean, l.Q_bar)
@@ -149,7 +150,9 @@ def test_presets_of_the_references():
         if not isinstance(rule, MASAC | MADDPG):
             continue
         plain = PRESETS["paper"](rule)
-        assert (plain.normalise, plain.heads, plain.average) == (False, "team", 1.0), name
+        assert (plain.normalise, plain.heads, plain.ema_rate) == (False, "team", 1.0), name
+    for name in ("decentralised-sac", "centralised-sac"):
+        assert PRESETS["paper"](ALGORITHMS[name]).sac == PRESETS["paper"](MASAC())
     assert PRESETS["paper"](ALGORITHMS["critic-only"]).constraint.weight == 1.0
     assert PRESETS["paper"](ALGORITHMS["matd3"]).critics == 2
 
@@ -160,9 +163,9 @@ def test_presets_of_the_references():
         (lambda: MADDPG(noise=0.0), "noise:"),
         (lambda: MADDPG(critics=3), "critics:"),
         (lambda: MADDPG(delay=0), "delay:"),
-        (lambda: DecentralisedSAC(shared=True), "shared:"),
-        (lambda: DecentralisedSAC(constraint=Lyapunov()), "constraint:"),
-        (lambda: CentralisedSAC(shared=True), "shared:"),
+        (lambda: DecentralisedSAC(MASAC(shared=True)), "sac.shared:"),
+        (lambda: DecentralisedSAC(MASAC(constraint=Lyapunov())), "sac.constraint:"),
+        (lambda: CentralisedSAC(MASAC(shared=True)), "sac.shared:"),
         (lambda: Lyapunov(reading="critic", function="norm"), "function:"),
     ],
 )

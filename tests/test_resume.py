@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import shrunk
 
 from marlyap import config, events, programs, store
 from marlyap.algorithms import ALGORITHMS, MASAC
@@ -29,6 +30,7 @@ from marlyap.dynamics import SingleIntegrator
 from marlyap.errors import UserError
 from marlyap.fit import Diverged, advance, fit as fit_runs
 from marlyap.game import AbstractGame
+from marlyap.health import Health
 from marlyap.rollout import first_fault
 from marlyap.run import Run, begin, flatten
 from marlyap.runs import launch as launching
@@ -55,12 +57,12 @@ SINGLE, PAIR = (5,), (5, 6)
 def trainer(name, schedule=SCHEDULE):
     """A tiny one; `name` may go on with a reading of the Lyapunov constraint, after a colon."""
     name, _, reading = name.partition(":")
-    algorithm, small = ALGORITHMS[name], dict(actor_width=4, critic_width=4, batch=4)
-    small = {field: size for field, size in small.items() if hasattr(algorithm, field)}
+    algorithm = shrunk(ALGORITHMS[name], actor_width=4, critic_width=4, batch=4)
     if reading:
         function = "norm" if reading == "score" else "squares"
-        small["constraint"] = Lyapunov(reading=reading, function=function)
-    return Trainer(GAME, dataclasses.replace(algorithm, **small), schedule)
+        constraint = Lyapunov(reading=reading, function=function)
+        algorithm = dataclasses.replace(algorithm, constraint=constraint)
+    return Trainer(GAME, algorithm, schedule)
 
 
 def runs_in(place, name, seeds):
@@ -199,10 +201,12 @@ def test_each_algorithm_and_each_reading_resumes_bit_for_bit(
 
 def test_the_whole_state_is_in_the_checkpoint(uninterrupted):
     (whole,) = uninterrupted("masac-lyapunov", SINGLE)
-    parts = ("learner", "memory", "key", "iteration", "best", "score")
+    parts = ("learner", "key", "iteration", "best", "score")
     for part in parts:
         assert any(key.startswith(f".{part}") for key in whole["arrays"]), part
     assert {key.split(".")[1].split("[")[0] for key in whole["arrays"]} == {*parts}
+    for part in (".learner.networks", ".learner.memory"):
+        assert any(key.startswith(part) for key in whole["arrays"]), part
     assert all(len(part) for part in ("arrays", "policy", "log"))
 
 
@@ -348,7 +352,7 @@ def poison(monkeypatch, seeds):
         carry, seconds, warnings = load(self)
         if self.seed in seeds:
             nan = jnp.full((), jnp.nan, jnp.float32)
-            carry = eqx.tree_at(lambda c: c.learner.log_alpha.value, carry, nan)
+            carry = eqx.tree_at(lambda c: c.learner.networks.log_alpha.value, carry, nan)
         return carry, seconds, warnings
 
     monkeypatch.setattr(Run, "load", poisoned)
@@ -452,18 +456,19 @@ def test_the_agent_and_the_step_of_a_bad_reward_are_named():
     says = r"reward: .* in the warm-up \(seed 0\), first for agent 1 at step 2; correct the task"
     with pytest.raises(UserError, match=says):
         begin(Trainer(game, trainer("masac").algorithm, SCHEDULE), 0)
-    line = {f"bad_{name}": -1.0 for name in ("obs", "features", "cost", "action", "learner")}
-    line |= {"seed": 0, "iteration": 7, "J_Q": np.nan, "bad_reward": 5.0}
-    assert FIT._fault(line) == "reward"
-    says = FIT._advice("reward", line, 2)
-    assert "in iteration 7 (seed 0), first for agent 1 at step 2; correct the task" in says
-    line["bad_reward"] = -1.0
-    assert FIT._fault(line) == "J_Q"
+    line, sound = {"seed": 0, "iteration": 7, "J_Q": np.nan}, Health.sound()
+    fault = lambda health: FIT._fault(line, health, 2)
+    found = fault(sound._replace(reward=jnp.asarray(5), negative=jnp.asarray(1)))
+    says = "in iteration 7 (seed 0), first for agent 1 at step 2; correct the task"
+    assert found.name == "reward" and says in found.says()
+    found = fault(sound._replace(negative=jnp.asarray(0)))
+    assert found.says().startswith("cost: the task returned a negative number in iteration 7")
+    assert fault(sound).name == "J_Q"
     line["J_Q"] = 0.0
-    assert FIT._fault(line) is None
-    line["bad_learner"] = 0.0
-    assert FIT._fault(line) == "learner"
-    assert "training made" in FIT._advice("learner", line, 2)
+    assert fault(sound) is None
+    assert fault(sound._replace(action=jnp.asarray(0))).name == "action"
+    found = fault(sound._replace(networks=jnp.asarray(1)))
+    assert found.name == "networks" and "training made" in found.says()
 
 
 def test_the_first_fault_of_an_episode():

@@ -16,9 +16,11 @@ from marlyap.errors import UserError
 from marlyap.evaluation import compare, episode, evaluate, pooled
 from marlyap.nets import Greedy, Sampled
 from marlyap.rollout import Decentralised
+from marlyap.schedule import Schedule
 from marlyap.seeds import stream
+from marlyap.source import CostWindow, shape
 from marlyap.tasks import Rendezvous
-from marlyap.trainer import Schedule, Trainer, shape
+from marlyap.trainer import Trainer
 
 
 PURPOSES = ("train", "select", "evaluate", "calibrate", "certify", "perturb")
@@ -43,7 +45,7 @@ def trainer(game, masac):
 
 @pytest.fixture(scope="module")
 def begun(trainer):
-    return eqx.filter_jit(lambda trainer, key: trainer.begin(key))(trainer, stream(0, "train"))
+    return eqx.filter_jit(lambda trainer, key: trainer.begin(key)[0])(trainer, stream(0, "train"))
 
 
 @eqx.filter_jit
@@ -93,7 +95,7 @@ def test_nothing_is_compiled_twice(trainer, later):
 
 
 def test_the_warm_up_fills_the_memory(trainer, begun):
-    memory, game = begun.memory, trainer.game
+    memory, game = begun.learner.memory, trainer.game
     assert (memory.rows, memory.time) == (9, 6)
     assert (int(memory.size), int(memory.head)) == (4, 4)  # 20 steps are begun, not cut
     e = jax.tree.map(lambda x: np.asarray(x)[:4], memory.episodes)
@@ -106,24 +108,24 @@ def test_the_warm_up_fills_the_memory(trainer, begun):
 
 
 def test_each_iteration_plays_and_remembers(later):
-    assert [int(c.memory.size) for c in later] == [4, 6, 8, 9, 9]
-    assert [int(c.memory.head) for c in later] == [4, 6, 8, 1, 3]
+    assert [int(c.learner.memory.size) for c in later] == [4, 6, 8, 9, 9]
+    assert [int(c.learner.memory.head) for c in later] == [4, 6, 8, 1, 3]
     assert [int(c.iteration) for c in later] == [0, 1, 2, 3, 4]
-    old, new = (np.asarray(c.memory.episodes.features) for c in (later[1], later[2]))
+    old, new = (np.asarray(c.learner.memory.episodes.features) for c in (later[1], later[2]))
     changed = np.any((old != new).reshape(9, -1), axis=1)
     np.testing.assert_array_equal(changed, np.isin(np.arange(9), [6, 7]))
-    moved = lambda c: np.asarray(jax.tree.leaves(c.learner.pi.value)[0])
+    moved = lambda c: np.asarray(jax.tree.leaves(c.learner.networks.pi.value)[0])
     assert all(np.any(moved(a) != moved(b)) for a, b in zip(later, later[1:], strict=False))
 
 
 def test_episodes_are_the_game_played_by_the_policy(trainer, later):
     """Each successor is one step of the game away, and the costs to go are of what followed."""
     game, T = trainer.game, 3
-    learner, key = later[1].learner, jax.random.key(3)
+    learner, key = later[1].learner.networks, jax.random.key(3)
 
     @eqx.filter_jit
     def played(trainer, learner, key):
-        e = trainer.play(trainer.algorithm.explore(learner), key, 1)
+        e = trainer.play(trainer.algorithm.explore(learner), key, 1, CostWindow(T, beyond=True))
         k_start, _ = jax.random.split(jax.random.split(key, 1)[0])
         state = game.reset(k_start)
         see = lambda s, a: (game.observations(s), game.features(s), game.costs(s, a))
@@ -166,11 +168,11 @@ def test_the_decay_reaches_every_update(trainer, later):
     end = eqx.tree_at(lambda c: c.iteration, later[1], later[1].iteration + 10**6)
     after, info = iterate(trainer, end)
     for part in ("pi", "Q", "log_alpha"):
-        value = lambda c, part=part: getattr(c.learner, part).value
+        value = lambda c, part=part: getattr(c.learner.networks, part).value
         assert same(value(after), value(end))
         assert not same(value(later[2]), value(end))
-    assert int(after.memory.size) == 6 + 2
-    assert all(np.isfinite(v).all() for v in info.values())
+    assert int(after.learner.memory.size) == 6 + 2
+    assert all(np.isfinite(v).all() for v in info.log.values())
 
 
 def test_budgets_are_counted_in_environment_steps(trainer):
@@ -195,15 +197,15 @@ def test_bad_schedules_are_named():
 def test_the_best_policy_is_kept(trainer, later):
     judge = eqx.filter_jit(lambda trainer, carry: trainer.judge(carry))
     carry, info = judge(trainer, later[1])
-    policy = Decentralised(Greedy(later[1].learner.pi_mean), trainer.game)
+    policy = Decentralised(Greedy(later[1].learner.networks.pi_mean), trainer.game)
     final = evaluate(trainer.game, policy, 64, 0, "select").final
     assert float(info["success"]) == pytest.approx(np.mean(final <= trainer.game.radius))
     assert float(info["distance"]) == pytest.approx(np.mean(final), rel=1e-4)
-    assert same(carry.best, trainer.algorithm.exploit(later[1].learner))
+    assert same(carry.best, trainer.algorithm.policy(later[1].learner.networks))
     unbeaten = eqx.tree_at(lambda c: c.score, later[1], jnp.asarray(2.0))
     kept, _ = judge(trainer, unbeaten)
     assert same(kept.best, later[1].best) and float(kept.score) == 2
-    assert same(kept.learner, later[1].learner) and same(kept.memory, later[1].memory)
+    assert same(kept.learner, later[1].learner)
 
 
 # Random streams.
@@ -261,7 +263,7 @@ def test_the_same_seed_gives_the_same_starts(wide):
 
 def test_no_evaluation_starts_where_training_did(wide, begun):
     """Neither are the first observations of the memory among those of the evaluation."""
-    e = begun.memory.episodes
+    e = begun.learner.memory.episodes
     state = seen(wide, 0.0, 0).state
     gap = state.scenario.goal[:, 0] - state.x[:, 0, :, :2]  # [episode, agent, 2]
     trained = np.linalg.norm(np.asarray(e.features)[:4, 0, :, :2], axis=-1)

@@ -23,36 +23,42 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from marlyap.algorithm import AbstractModelBased
+from marlyap.algorithm import AbstractAlgorithm, Info, Log, unwatched
+from marlyap.devices import spread
 from marlyap.errors import within
 from marlyap.game import AbstractGame
-from marlyap.learn import Learnt, polyak
+from marlyap.health import Health, first_negative
 from marlyap.nets import Actors, Greedy
+from marlyap.optimiser import TrainState, polyak
 from marlyap.rollout import Decentralised, charged, first_fault, rollout
-from marlyap.types import Key, Scalar
+from marlyap.schedule import Schedule
+from marlyap.types import Key, Keys, Scalar
 
 
-class Learner(eqx.Module):
-    pi: Learnt[Actors]
+class Networks(eqx.Module):
+    pi: TrainState[Actors]
     pi_mean: Actors  # running mean of pi: the policy that is deployed
 
 
-class APG(AbstractModelBased):
+class APG(AbstractAlgorithm):
     """Analytic policy gradients: learns by differentiating the game, so the model must be known."""
+
+    # 1,500 updates on 128 episodes each: playing is cheap where no critic is to be learnt.
+    default_schedule = Schedule(steps=7_680_000, environments=128, judge_every=50)
 
     rate_pi: float = 2e-3  # learning rate
     actor_width: int = 64  # units in each of two hidden layers
     shared: bool = False  # one set of actor weights for all agents
     sharpness: float = 0.5  # extra cost of being outside the ball, beside the distance (m)
     clip: float = 1.0  # largest norm of a gradient
-    average: float = 1e-2  # how fast the deployed policy follows the actor; 1 is the actor itself
+    ema_rate: float = 1e-2  # how fast the deployed policy follows the actor; 1 is the actor itself
     weight: float = 0.0  # of the decrease condition
     T: int = 20  # steps over which the cost has to fall
     decrease: float = 0.1  # share by which the cost has to fall over T steps
 
     def __check_init__(self):
         within("rate_pi", self.rate_pi, 0, 1)
-        within("average", self.average, 0, 1, open=True)
+        within("ema_rate", self.ema_rate, 0, 1, open=True)
         within("decrease", self.decrease, 0, 1)
         within("clip", self.clip, 0, 1e6, open=True)
         within("actor_width", self.actor_width, 1, 1_000_000)
@@ -62,7 +68,22 @@ class APG(AbstractModelBased):
 
     def init(self, shape, key):
         pi = Actors(shape, self.actor_width, self.shared, key=key)
-        return Learner(Learnt.of(pi), pi)
+        return Networks(TrainState.of(pi), pi)
+
+    def updates_per_iteration(self, play):
+        return 1
+
+    def begin(self, play, keys):
+        """Nothing is played before the first iteration."""
+        play.source.model()
+        return self.init(play.source.shape, keys.learn), Health.sound()
+
+    def iterate(self, learner, play, keys, decay, watch=unwatched):
+        """One update on fresh episodes, whose gradient is taken through the game."""
+        starts = spread(jax.random.split(keys.play, play.schedule.environments))
+        learner, log, health = self.improve(learner, play.source.model(), starts, decay)
+        seen = jax.tree.map(lambda x: x[None], watch(learner))
+        return learner, Info(log, health, seen)
 
     def J(
         self, pi: Actors, game: AbstractGame, key: Key
@@ -87,9 +108,11 @@ class APG(AbstractModelBased):
         delta = jax.nn.relu(ahead - (1 - self.decrease) * now)
         return jnp.mean(jnp.where(now >= game.edge, delta, 0.0))
 
-    def improve(self, learner, game, keys, decay):
+    def improve(
+        self, networks: Networks, game: AbstractGame, keys: Keys, decay: Scalar
+    ) -> tuple[Networks, Log, Health]:
         """phi <- phi - rate grad J, clipped to norm `clip`; entries not finite count as 0."""
-        l = learner
+        l = networks
 
         @eqx.filter_value_and_grad(has_aux=True)
         def expectation(pi):
@@ -101,17 +124,18 @@ class APG(AbstractModelBased):
         norm = jnp.sqrt(sum(jnp.sum(g**2) for g in jax.tree.leaves(finite)))
         clipped = jax.tree.map(lambda g: g * jnp.minimum(1.0, self.clip / (norm + 1e-12)), finite)
         pi = l.pi.step(clipped, decay * self.rate_pi)
-        info = {
+        log = {
             "J_pi": loss,
             "gradient": norm,
             "return": jnp.mean(jnp.sum(jnp.mean(reward, axis=2), axis=1)),
-            "bad_cost": first_fault(cost),
-            "bad_reward": first_fault(reward),
         }
-        return Learner(pi, polyak(pi.value, l.pi_mean, self.average)), info
+        health = Health.sound()._replace(
+            cost=first_fault(cost), reward=first_fault(reward), negative=first_negative(cost)
+        )
+        return Networks(pi, polyak(pi.value, l.pi_mean, self.ema_rate)), log, health
 
-    def exploit(self, learner):
-        return Greedy(learner.pi_mean)
+    def policy(self, networks):
+        return Greedy(networks.pi_mean)
 
-    def lyapunov(self, learner):
+    def lyapunov(self, networks):
         return None

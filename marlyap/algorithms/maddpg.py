@@ -15,6 +15,7 @@ all agents' values and not its own alone, for the game is cooperative; and in th
 agents' actions come from their current policies and not from the memory.
 """
 
+import dataclasses
 from typing import Literal
 
 import equinox as eqx
@@ -22,18 +23,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from marlyap.algorithm import AbstractOffPolicy
+from marlyap.algorithms.masac import PLAIN
 from marlyap.errors import within
-from marlyap.learn import Learnt, polyak
 from marlyap.nets import Actors, Critic, Greedy, Noisy
+from marlyap.off_policy import AbstractOffPolicy
+from marlyap.optimiser import TrainState, polyak
+from marlyap.source import CostWindow
 from marlyap.types import Action, Scalar, Transition
 
 
-class Learner(eqx.Module):
-    pi: Learnt[Actors]
+class Networks(eqx.Module):
+    pi: TrainState[Actors]
     pi_bar: Actors
     pi_mean: Actors  # running mean of pi: the policy that is deployed
-    Q: Learnt[Critic]
+    Q: TrainState[Critic]
     Q_bar: Critic
     updates: Int[Array, ""]
 
@@ -54,14 +57,14 @@ class MADDPG(AbstractOffPolicy):
     normalise: bool = True  # LayerNorm in the critics
     heads: Literal["team", "agent"] = "agent"  # a value for the team, or one for each agent's cost
     shared: bool = False  # one set of actor weights for all agents
-    average: float = 1e-3  # how fast the deployed policy follows the actor; 1 is the actor itself
+    ema_rate: float = 1e-3  # how fast the deployed policy follows the actor; 1 is the actor itself
     critics: int = 1  # with 2 the smaller value is the target
     smoothing: float = 0.0  # standard deviation of the noise on the target's actions
     smoothing_clip: float = 0.5  # largest noise on the target's actions
     delay: int = 1  # critic updates for one of the actors and targets
 
     def __check_init__(self):
-        for name in ("gamma", "tau", "average"):
+        for name in ("gamma", "tau", "ema_rate"):
             within(name, getattr(self, name), 0, 1, open=name != "gamma")
         for name in ("rate_pi", "rate_Q"):
             within(name, getattr(self, name), 0, 1)
@@ -74,17 +77,21 @@ class MADDPG(AbstractOffPolicy):
         within("critics", self.critics, 1, 2)
 
     @property
-    def foresight(self):
-        return 1, False
+    def cost_window(self):
+        return CostWindow()
+
+    def paper(self):
+        """Plain networks and one value for the team, as in section 4 of the paper."""
+        return dataclasses.replace(self, **PLAIN)
 
     def init(self, shape, key):
         k_pi, k_Q = jax.random.split(key)
         pi = Actors(shape, self.actor_width, self.shared, key=k_pi)
         heads = shape.agents if self.heads == "agent" else 1
         Q = Critic(shape, self.critic_width, heads, self.normalise, self.critics, key=k_Q)
-        return Learner(Learnt.of(pi), pi, pi, Learnt.of(Q), Q, jnp.asarray(0))
+        return Networks(TrainState.of(pi), pi, pi, TrainState.of(Q), Q, jnp.asarray(0))
 
-    def J_Q(self, Q: Critic, l: Learner, b: Transition, next_action: Action) -> Scalar:
+    def J_Q(self, Q: Critic, l: Networks, b: Transition, next_action: Action) -> Scalar:
         """(6) of Lowe et al., for every critic; the smaller target where there are two."""
         Q_next = jnp.min(l.Q_bar(b.next_features, next_action), axis=0)
         y = self.reward_scale * self.team(b.reward) + b.discount * Q_next
@@ -94,9 +101,9 @@ class MADDPG(AbstractOffPolicy):
         """Minus the team's value of the current policies' actions, by the first critic."""
         return -jnp.mean(Q(b.features, pi.mode(b.obs))[0])
 
-    def update(self, learner, b, decay):
+    def update(self, networks, b, decay):
         """Algorithm 1 of Lowe et al., with the three changes of Fujimoto et al. in it."""
-        l = learner
+        l = networks
 
         # a' = mu'(o') + clip(eps, -c, c)
         eps = self.smoothing * b.noise[:, :, 0]
@@ -114,22 +121,22 @@ class MADDPG(AbstractOffPolicy):
         # the targets follow; all but the critic moves at every `delay`-th update only
         follow = lambda new, old: polyak(new, old, self.tau)
         pi_bar, Q_bar = follow(pi.value, l.pi_bar), follow(Q.value, l.Q_bar)
-        moved = (pi, pi_bar, polyak(pi.value, l.pi_mean, self.average), Q_bar)
+        moved = (pi, pi_bar, polyak(pi.value, l.pi_mean, self.ema_rate), Q_bar)
         due = (l.updates + 1) % self.delay == 0
         keep = lambda new, old: jnp.where(due, new, old) if eqx.is_array(new) else new
         stayed = (l.pi, l.pi_bar, l.pi_mean, l.Q_bar)
         pi, pi_bar, pi_mean, Q_bar = jax.tree.map(keep, moved, stayed)
 
         info = {"J_Q": loss_Q, "J_pi": loss_pi}
-        return Learner(pi, pi_bar, pi_mean, Q, Q_bar, l.updates + 1), info
+        return Networks(pi, pi_bar, pi_mean, Q, Q_bar, l.updates + 1), info
 
-    def explore(self, learner):
-        return Noisy(learner.pi.value, self.noise)
+    def explore(self, networks):
+        return Noisy(networks.pi.value, self.noise)
 
-    def exploit(self, learner):
-        return Greedy(learner.pi_mean)
+    def policy(self, networks):
+        return Greedy(networks.pi_mean)
 
-    def lyapunov(self, learner):
+    def lyapunov(self, networks):
         return None
 
     def team(self, per_agent):

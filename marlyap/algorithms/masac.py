@@ -19,6 +19,7 @@ entropy, (6)-(8) J_Q, its gradient and delta_Q, (9)-(11) policy improvement, (12
 says what was corrected.
 """
 
+import dataclasses
 from typing import Literal
 
 import equinox as eqx
@@ -26,21 +27,25 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from marlyap.algorithm import AbstractOffPolicy
 from marlyap.constraint import AbstractConstraint, Unconstrained
 from marlyap.errors import within
-from marlyap.learn import Learnt, in_parts, parts, polyak
 from marlyap.nets import Actors, Critic, Greedy, MeanFieldCritic, Sample, Sampled
+from marlyap.off_policy import AbstractOffPolicy
+from marlyap.optimiser import TrainState, in_parts, parts, polyak
 from marlyap.rollout import AbstractExplorer, Policy
 from marlyap.types import Scalar, Transition
 
 
-class Learner(eqx.Module):
-    pi: Learnt[Actors]
+# What section 4 of the paper has otherwise than we do.
+PLAIN = {"normalise": False, "heads": "team", "ema_rate": 1.0, "reward_scale": 1.0}
+
+
+class Networks(eqx.Module):
+    pi: TrainState[Actors]
     pi_mean: Actors  # running mean of pi: the policy that is deployed
-    Q: Learnt[Critic | MeanFieldCritic]
+    Q: TrainState[Critic | MeanFieldCritic]
     Q_bar: Critic | MeanFieldCritic
-    log_alpha: Learnt[Scalar]
+    log_alpha: TrainState[Scalar]
     L: PyTree  # the constraint's
 
 
@@ -63,12 +68,12 @@ class MASAC(AbstractOffPolicy):
     heads: Literal["team", "agent"] = "agent"  # a value for the team, or one for each agent's cost
     shared: bool = False  # one set of actor weights for all agents
     critic: Literal["joint", "mean-field"] = "joint"  # of everyone, or of one and the others' mean
-    average: float = 1e-3  # how fast the deployed policy follows the actor; 1 is the actor itself
-    keep_Q: bool = True  # false drops Q from the policy objective (Han et al. 2020)
+    ema_rate: float = 1e-3  # how fast the deployed policy follows the actor; 1 is the actor itself
+    use_Q: bool = True  # false drops Q from the policy objective (Han et al. 2020)
     constraint: AbstractConstraint = Unconstrained()  # the Lyapunov condition, if any
 
     def __check_init__(self):
-        for name in ("gamma", "tau", "average"):
+        for name in ("gamma", "tau", "ema_rate"):
             within(name, getattr(self, name), 0, 1, open=name != "gamma")
         for name in ("rate_pi", "rate_Q", "rate_alpha"):
             within(name, getattr(self, name), 0, 1)
@@ -78,11 +83,15 @@ class MASAC(AbstractOffPolicy):
             within(name, getattr(self, name), 1, 1_000_000)
 
     @property
-    def foresight(self):
-        return self.constraint.foresight
+    def cost_window(self):
+        return self.constraint.cost_window
 
     def fits(self, agents):
         self.constraint.fits(agents)
+
+    def paper(self):
+        """Section 4: plain networks, one value for the team, the weight of Delta L learnt."""
+        return dataclasses.replace(self, **PLAIN, constraint=self.constraint.paper())
 
     def init(self, shape, key):
         k_pi, k_Q, k_L = jax.random.split(key, 3)
@@ -95,9 +104,9 @@ class MASAC(AbstractOffPolicy):
             Q = Critic(shape, self.critic_width, heads, self.normalise, key=k_Q)
         log_alpha = jnp.log(jnp.full((), self.alpha, jnp.float32))
         L = self.constraint.init(shape, k_L)
-        return Learner(Learnt.of(pi), pi, Learnt.of(Q), Q, Learnt.of(log_alpha), L)
+        return Networks(TrainState.of(pi), pi, TrainState.of(Q), Q, TrainState.of(log_alpha), L)
 
-    def J_Q(self, Q: Critic | MeanFieldCritic, l: Learner, b: Transition, nxt: Sample) -> Scalar:
+    def J_Q(self, Q: Critic | MeanFieldCritic, l: Networks, b: Transition, nxt: Sample) -> Scalar:
         """Eq. (6), the soft Bellman residual of both critics.
 
         The printed target adds the entropy to a V that already has it; here it enters once,
@@ -110,7 +119,7 @@ class MASAC(AbstractOffPolicy):
         y = self.reward_scale * self.team(b.reward) + b.discount * V_next
         return 0.5 * jnp.sum(jnp.mean((Q(b.features, b.action) - y[None]) ** 2, axis=1))
 
-    def J_pi(self, now: Sample, nxt: Sample, l: Learner, b: Transition) -> Scalar:
+    def J_pi(self, now: Sample, nxt: Sample, l: Networks, b: Transition) -> Scalar:
         """Eq. (10) as a function of the drawn actions; (14) when there is a constraint.
 
         All actions come from the current policies; the smaller twin is used here too.
@@ -118,16 +127,16 @@ class MASAC(AbstractOffPolicy):
         alpha = jnp.exp(l.log_alpha.value)
         Q = jnp.mean(jnp.min(l.Q.value(b.features, now.action), axis=0))
         beta_Delta_L = self.constraint.penalty(l.L, b, now, nxt)
-        return alpha * jnp.sum(now.log_prob) - self.keep_Q * Q + beta_Delta_L
+        return alpha * jnp.sum(now.log_prob) - self.use_Q * Q + beta_Delta_L
 
     def J_alpha(self, log_alpha: Scalar, now: Sample) -> Scalar:
         """Eq. (12), with one temperature and the joint entropy."""
         surplus = jnp.sum(now.log_prob + self.entropy)
         return -jnp.exp(log_alpha) * surplus
 
-    def update(self, learner, b, decay):
+    def update(self, networks, b, decay):
         """The assignments of Algorithm 2 in its order; without a constraint, of Algorithm 1."""
-        l = learner
+        l = networks
         n = parts(*b.obs.shape[:2])  # of the batch, one after the other: 1 for small teams
 
         # a ~ pi_phi(. | s_t) and a_{t+1} ~ pi_phi(. | s_{t+1}): the same for every objective
@@ -153,23 +162,23 @@ class MASAC(AbstractOffPolicy):
         Q_bar = polyak(Q.value, l.Q_bar, self.tau)
         L, info = self.constraint.update(l.L, b, now, nxt, decay)
 
-        pi_mean = polyak(pi.value, l.pi_mean, self.average)
+        pi_mean = polyak(pi.value, l.pi_mean, self.ema_rate)
         info |= {
             "J_Q": loss_Q,
             "J_pi": loss_pi,
             "alpha": jnp.exp(log_alpha.value),
             "entropy": -jnp.mean(jnp.sum(now.log_prob, axis=1)),
         }
-        return Learner(pi, pi_mean, Q, Q_bar, log_alpha, L), info
+        return Networks(pi, pi_mean, Q, Q_bar, log_alpha, L), info
 
-    def explore(self, learner) -> AbstractExplorer:
-        return Sampled(learner.pi.value)
+    def explore(self, networks) -> AbstractExplorer:
+        return Sampled(networks.pi.value)
 
-    def exploit(self, learner) -> Policy:
-        return Greedy(learner.pi_mean)
+    def policy(self, networks) -> Policy:
+        return Greedy(networks.pi_mean)
 
-    def lyapunov(self, learner):
-        return self.constraint.lyapunov(learner.L)
+    def lyapunov(self, networks):
+        return self.constraint.lyapunov(networks.L)
 
     def team(self, per_agent):
         """What the critics' heads stand for: the team's mean, or each agent."""

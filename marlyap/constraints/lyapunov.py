@@ -37,6 +37,7 @@ What the condition does not say:
   `norm` it is.
 """
 
+import dataclasses
 from typing import Literal
 
 import equinox as eqx
@@ -45,18 +46,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from marlyap.constraint import AbstractConstraint
+from marlyap.constraints.readings import READINGS, Terms, mean_over, rise
 from marlyap.errors import UserError, within
-from marlyap.learn import Learnt, polyak
 from marlyap.nets import LyapunovNet, NormNet, Sample
+from marlyap.optimiser import TrainState, polyak
+from marlyap.source import CostWindow
 from marlyap.types import Action, Scalar, Transition
 
 
-class Certificate(eqx.Module):
+class LearnedLyapunov(eqx.Module):
     """What the constraint has learnt."""
 
-    net: Learnt[LyapunovNet | NormNet]
+    net: TrainState[LyapunovNet | NormNet]
     net_bar: LyapunovNet | NormNet  # slow copy, for targets that bootstrap
-    log_weight: Learnt[Scalar]
+    log_weight: TrainState[Scalar]
     gradient: Scalar  # the 95 % quantile over a batch of |grad L| by features, a running mean
     scale: Scalar  # running mean square of the fall of L, for `score`
 
@@ -67,9 +70,7 @@ class Lyapunov(AbstractConstraint):
     Raises UserError for values out of range and for readings and functions that do not fit.
     """
 
-    reading: Literal["han", "literal", "hinge", "score", "critic"] = (
-        "han"  # how Delta L is read (see above)
-    )
+    reading: str = "han"  # how Delta L is read; one of han, literal, hinge, score, critic
     function: Literal["squares", "norm"] = "squares"  # L(s, a) sum of squares, or V(s) norm-like
     horizon: int = 10  # T of L_target, in steps
     target: Literal["rollout", "hold_last", "bootstrap", "discounted"] = "rollout"  # what L learns
@@ -89,13 +90,19 @@ class Lyapunov(AbstractConstraint):
     tau: float = 0.005  # how fast the slow copy of L follows
 
     def __check_init__(self):
-        if self.function == "norm" and self.reading in ("han", "critic"):
+        if self.reading not in READINGS:
+            names = ", ".join(READINGS)
+            raise UserError(f"reading: '{self.reading}' is unknown; take one of {names}.")
+        fit = READINGS[self.reading].functions
+        if self.function == "norm" not in fit:
+            others = [name for name, r in READINGS.items() if "norm" in r.functions]
             raise UserError(
                 "function: 'norm' is a function of the state alone, which gives the reading "
-                f"'{self.reading}' no gradient; take reading score or hinge, or function squares."
+                f"'{self.reading}' no gradient; take function squares or a reading among "
+                f"{', '.join(others)}."
             )
-        if self.function == "squares" and self.reading == "score":
-            raise UserError("reading: 'score' needs function norm.")
+        if self.function not in fit:
+            raise UserError(f"reading: '{self.reading}' needs function {' or '.join(fit)}.")
         if self.function == "squares" and self.slope == "spectral":
             raise UserError("slope: 'spectral' needs function norm.")
         within("horizon", self.horizon, 1, 10_000)
@@ -110,19 +117,24 @@ class Lyapunov(AbstractConstraint):
             raise UserError(f"agents: {self.agents} names an agent twice.")
 
     @property
-    def foresight(self):
-        return self.horizon, self.target == "rollout"
+    def cost_window(self):
+        return CostWindow(self.horizon, beyond=self.target == "rollout")
 
     def fits(self, agents):
         for i in self.agents:
             within("--algorithm.constraint.agents", i, 0, agents - 1)
+
+    def paper(self):
+        """The weight of Delta L is learnt; the paper does not have the reading `critic`."""
+        learnt = READINGS[self.reading].condition
+        return dataclasses.replace(self, weight=None) if learnt else self
 
     def init(self, shape, key):
         make = LyapunovNet if self.function == "squares" else NormNet
         net = make(shape, self.normalise, key=key)
         one = jnp.ones((), jnp.float32)
         log_weight = jnp.log(self.weight_start * one)
-        return Certificate(Learnt.of(net), net, Learnt.of(log_weight), one, one)
+        return LearnedLyapunov(TrainState.of(net), net, TrainState.of(log_weight), one, one)
 
     def lyapunov(self, L):
         return L.net.value
@@ -133,35 +145,33 @@ class Lyapunov(AbstractConstraint):
         The action in the memory is b.action; `now` and `nxt` are drawn from the current policy at s
         and s'.
         """
-        now, nxt = self.held(now), self.held(nxt)
-        net, moved = L.net.value, distance(now.action, b.action)
-        if self.reading == "han":
-            term = self.rise(L, b, nxt.action)
-        elif self.reading == "literal":
-            term = self.rise(L, b, jax.lax.stop_gradient(nxt.action)) + self.lipschitz(L) * moved
-        elif self.reading == "hinge":
-            rise = jax.lax.stop_gradient(self.rise(L, b, nxt.action))
-            bound = jax.nn.relu(rise + self.lipschitz(L) * moved)
-            term = jnp.where(rise <= 0, bound, 0.0)
-        elif self.reading == "critic":
-            term = net(b.features, now.action)
-        else:
-            fall = net(b.features, b.action) - net(b.next_features, b.action)
-            advantage = (fall - self.decrease * self.team(b.cost)) / jnp.sqrt(L.scale)
-            term = self.surrogate(now, b, jax.lax.stop_gradient(advantage))
+        terms = Terms(
+            L=L.net.value,
+            b=b,
+            now=self.held(now),
+            nxt=self.held(nxt),
+            due=self.due(b),
+            slope=self.lipschitz(L),
+            scale=L.scale,
+            clip=self.clip,
+            agents=self.agents,
+        )
+        term = READINGS[self.reading](terms)
         return self.multiplier(L) * jnp.where(self.applies(b), term, 0.0)
 
-    def rise(self, L: Certificate, b: Transition, next_action: Action) -> Scalar:
+    def rise(self, L: LearnedLyapunov, b: Transition, next_action: Action) -> Scalar:
         """L(s', a') - L(s, a) + decrease c, without the margin slope ||a_phi - a|| of Theorem 1."""
-        net = L.net.value
-        fall = net(b.features, b.action) - net(b.next_features, next_action)
-        return self.decrease * self.team(b.cost) - fall
+        return rise(L.net.value, b, next_action, self.due(b))
 
-    def J_L(self, net, b: Transition, nxt: Sample, L: Certificate) -> Scalar:
+    def due(self, b: Transition) -> Scalar:
+        """decrease c: L must fall by so much."""
+        return self.decrease * self.team(b.cost)
+
+    def J_L(self, net, b: Transition, nxt: Sample, L: LearnedLyapunov) -> Scalar:
         """J_L = 1/2 (L(s, a) - L_target)^2, below (14)."""
         return 0.5 * (net(b.features, b.action) - self.L_target(L, b, nxt)) ** 2
 
-    def L_target(self, L: Certificate, b: Transition, nxt: Sample) -> Scalar:
+    def L_target(self, L: LearnedLyapunov, b: Transition, nxt: Sample) -> Scalar:
         """The sum of the next T costs: as rolled out, or bootstrapped from c and the slow L."""
         now, ahead = self.team(b.cost), self.team(b.cost_ahead)
         if self.target == "bootstrap":
@@ -183,16 +193,16 @@ class Lyapunov(AbstractConstraint):
         log_weight = eqx.tree_at(lambda w: w.value, log_weight, bounded)
 
         info = {"J_L": loss, "weight": self.multiplier(L), "rise": surplus}
-        certificate = Certificate(
+        learned = LearnedLyapunov(
             net,
             polyak(net.value, L.net_bar, self.tau),
             log_weight,
             self.steepness(L, b) if self.slope == "empirical" else L.gradient,
             0.99 * L.scale + 0.01 * jnp.mean((rises - jnp.mean(rises)) ** 2),
         )
-        return certificate, info
+        return learned, info
 
-    def multiplier(self, L: Certificate) -> Scalar:
+    def multiplier(self, L: LearnedLyapunov) -> Scalar:
         """The weight of Delta L; no gradient reaches it through J_pi."""
         if self.weight is not None:
             return jnp.asarray(self.weight)
@@ -204,7 +214,7 @@ class Lyapunov(AbstractConstraint):
 
     def team(self, per_agent: Float[Array, "agent"]) -> Scalar:
         """The mean over the agents that the constraint is about."""
-        return jnp.mean(per_agent[jnp.array(self.agents)] if self.agents else per_agent)
+        return mean_over(self.agents, per_agent)
 
     def held(self, drawn: Sample) -> Sample:
         """The drawn actions, with a gradient only for the agents that the constraint is about."""
@@ -215,7 +225,7 @@ class Lyapunov(AbstractConstraint):
         action = jnp.where(mine, drawn.action, jax.lax.stop_gradient(drawn.action))
         return drawn._replace(action=action)
 
-    def lipschitz(self, L: Certificate) -> Scalar:
+    def lipschitz(self, L: LearnedLyapunov) -> Scalar:
         """l_L l_f, the change of L per unit of action."""
         if self.slope == "empirical":
             return L.gradient * self.input_gain
@@ -223,7 +233,7 @@ class Lyapunov(AbstractConstraint):
             return L.net.value.lipschitz() * self.input_gain
         return jnp.asarray(self.slope)
 
-    def steepness(self, L: Certificate, b: Transition) -> Scalar:
+    def steepness(self, L: LearnedLyapunov, b: Transition) -> Scalar:
         """The running 95 % quantile of |grad L| by the critic's features.
 
         Not l_L of Theorem 1, which is a bound (not a quantile) by the state s (not its features).
@@ -231,16 +241,3 @@ class Lyapunov(AbstractConstraint):
         total = lambda features: jnp.sum(jax.vmap(L.net.value)(features, b.action))
         size = jnp.sqrt(jnp.sum(jax.grad(total)(b.features) ** 2, axis=(1, 2)))
         return 0.99 * L.gradient + 0.01 * jnp.quantile(size, 0.95)
-
-    def surrogate(self, now: Sample, b: Transition, advantage: Scalar) -> Scalar:
-        """-min(ratio A, clipped ratio A), the mean over agents of each one's own ratio."""
-        ratio = jnp.exp(jnp.clip(now.log_prob_memory - b.log_prob, -20.0, 20.0))
-        near = jnp.clip(ratio, 1 - self.clip, 1 + self.clip)
-        return -self.team(jnp.minimum(ratio * advantage, near * advantage))
-
-
-def distance(a: Action, b: Action) -> Scalar:
-    """||a - b||, with a gradient of 0 where they are equal."""
-    square = jnp.sum((a - b) ** 2)
-    safe = jnp.where(square > 0, square, 1.0)
-    return jnp.where(square > 0, jnp.sqrt(safe), 0.0)

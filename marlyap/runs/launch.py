@@ -26,8 +26,11 @@ WORKER = (sys.executable, "-m", "marlyap.runs.worker")
 POLL = 0.2  # seconds between two looks at whether to stop
 
 
+USUAL = Launch()
+
+
 def launch(
-    runs: Iterable[Run], how: Launch = Launch(), stop: Callable[[], bool] = lambda: False
+    runs: Iterable[Run], how: Launch = USUAL, stop: Callable[[], bool] = lambda: False
 ) -> Iterator[events.Event]:
     """Train the runs that are not finished; yields what happens to them.
 

@@ -17,26 +17,26 @@ ADAM = optax.scale_by_adam()
 WHOLE, PART = 2_048, 512  # rows of a batch that are taken at once; rows of a part where not
 
 
-class Learnt(eqx.Module, Generic[M]):
+class TrainState(eqx.Module, Generic[M]):
     """theta and what Adam remembers of its gradients."""
 
     value: M
     memory: PyTree
 
     @classmethod
-    def of(cls, value: M) -> "Learnt[M]":
+    def of(cls, value: M) -> "TrainState[M]":
         """A parameter that has not moved yet."""
         return cls(value, ADAM.init(eqx.filter(value, eqx.is_inexact_array)))
 
-    def step(self, gradient: PyTree, rate: Scalar | float) -> "Learnt[M]":
+    def step(self, gradient: PyTree, rate: Scalar | float) -> "TrainState[M]":
         """theta <- theta - rate * gradient, preconditioned by Adam."""
         direction, memory = ADAM.update(gradient, self.memory)
         move = jax.tree.map(lambda d: -rate * d, direction)
-        return Learnt(eqx.apply_updates(self.value, move), memory)
+        return TrainState(eqx.apply_updates(self.value, move), memory)
 
     def descend(
         self, J: Callable[..., Scalar], *batch: PyTree, rate: Scalar | float, parts: int = 1
-    ) -> tuple["Learnt[M]", Scalar]:
+    ) -> tuple["TrainState[M]", Scalar]:
         """theta <- theta - rate * grad E_D[J(theta, *one)], and E_D[J] before the step.
 
         J takes the parameter and one row of each batched argument; the batch is taken in `parts`,
