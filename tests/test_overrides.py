@@ -92,7 +92,7 @@ class Own(Rendezvous):
         return state.x[:, 1] < -0.5
 
     def failed(self, state):
-        return jnp.any(state.x[:, 0] < -0.8)
+        return jnp.any(state.x[:, 0] < -0.93)
 
     @property
     def failure_cost(self):
@@ -175,7 +175,7 @@ def test_the_game_replaces_every_method():
 
 
 def test_the_plain_loop_meets_all_that_can_happen(oracle):
-    for name in ("success", "terminated", "violated"):
+    for name in ("success", "terminated", "violated", "failed"):
         hits = np.array([s[name].any() for s in oracle])
         assert 0 < hits.sum() < len(hits), name
 
