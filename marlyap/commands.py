@@ -12,14 +12,14 @@ from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from marlyap import config, film, groups, store
+from marlyap import config, groups, store
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.algorithms import ALGORITHMS, PRESETS
 from marlyap.certificate import arrival, sentence
@@ -33,7 +33,8 @@ from marlyap.evaluation import RESTS, evaluate
 from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import cost_sum
 from marlyap.recheck import recheck
-from marlyap.report import MARK, Film, Page, html
+from marlyap.report import contents, episodes
+from marlyap.report.data import MARK, Page
 from marlyap.run import Run, expand
 from marlyap.seeds import stream
 from marlyap.sensing import Entry
@@ -189,7 +190,7 @@ def measure(args: Namespace, overrides: Overrides) -> Result:
         notes += run.warnings
         result = evaluate(there, run.controller(there), args.episodes, starts)
         found.append(groups.of_run(run, result, starts, there, args.task or ""))
-        done, whole = film.progress(run)
+        done, whole = contents.progress(run)
         if done < whole:
             notes.append(f"{directory}: training is unfinished ({done} of {whole} steps).")
         if groups.same_game(there, run.game):
@@ -446,19 +447,25 @@ def report(args: Namespace, overrides: Overrides) -> Result:
     if out.exists() and not is_report(out):
         raise UserError(f"out: {out} exists and is not a report of marlyap; choose another file.")
     command = shlex.join(["marlyap", *sys.argv[1:]])
-    page = film.page(runs, args.episodes, starts_of(args.seed), command, games, args.task or "")
-    store.write_text_atomic(out, html(cast(Page, page)))
-    from marlyap import draw
+    page = contents.gather(
+        runs, args.episodes, starts_of(args.seed), command, games, args.task or ""
+    )
+    from marlyap.report import png  # late, as it loads Matplotlib
+    from marlyap.report.page import html
 
+    store.write_text_atomic(out, html(page))
     pictures = [out.with_name(f"{out.stem}-{name}") for name in ("starts.png", "learning.png")]
-    draw.trajectories_png(page["films"], pictures[0])
-    draw.learning_curves_png(page["runs"], pictures[1])
+    png.trajectories_png(page.films, pictures[0])
+    png.learning_curves_png(page.runs, pictures[1])
     say(f"Report: {out.resolve()}")
-    for note in page["notes"]:
+    for note in page.notes:
         say(note)
-    result = {"start_seed": page["starts"], "groups": page["groups"]}
-    if len(page["groups"]) == 1:
-        result = {k: v for k, v in page["groups"][0].items() if k != "text"} | result
+    result: dict[str, Any] = {
+        "start_seed": page.starts,
+        "groups": [dataclasses.asdict(g) for g in page.groups],
+    }
+    if len(page.groups) == 1:
+        result = {k: v for k, v in result["groups"][0].items() if k != "text"} | result
     return result | {"report": str(out), "pictures": [str(p) for p in pictures]}, 0
 
 
@@ -478,20 +485,20 @@ def watch(args: Namespace, overrides: Overrides) -> Result:
     if not place.is_dir():
         raise UserError(f"out: there is no directory {place}.")
     starts = starts_of(args.seed)
-    shot = film.one(run, args.episode, starts, game=game)
-    from marlyap import draw
+    shot = episodes.one(run, args.episode, starts, game=game)
+    from marlyap.report.gif import film_gif  # late, as it loads Matplotlib
+    from marlyap.report.page import html
 
     gif, page = place / "film.gif", place / "film.html"
-    draw.film_gif(cast(Film, shot), gif)
+    film_gif(shot, gif)
     title = f"One episode of {run.title}"
     about = f"start {args.episode} of the held-out starts of seed {starts}"
     if game is not run.game:
         about += f", on {groups.told(run.game, game, args.task or '')}"
-    text = html(cast(Page, {"title": title, "subtitle": about, "films": [shot]}))
-    store.write_text_atomic(page, text)
+    store.write_text_atomic(page, html(Page(title=title, subtitle=about, films=(shot,))))
     say(f"Film: {page.resolve()} and {gif.resolve()}")
     done = {"gif": str(gif), "html": str(page), "start_seed": starts}
-    return done | {"success": bool(shot["success"])}, 0
+    return done | {"success": bool(shot.success)}, 0
 
 
 def listing(args: Namespace, overrides: Overrides) -> Result:
