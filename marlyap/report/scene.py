@@ -283,7 +283,7 @@ def played(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _rounded(strip: Strip) -> list[list[float | None]]:
+def _rounded(strip: Strip) -> list[list[Number]]:
     """Four digits: of each value where the axis begins at 0, else of the axis."""
     low, high = strip.span
     if not low:
