@@ -57,7 +57,7 @@ REGIONS = {
 def seen(errors):
     """The one agent's state with these errors (e.h, e.n, v, w), up to a turn and a shift."""
     x = jnp.concatenate([jnp.zeros(3), errors[2:]])[None]
-    return State(x=x, goal=errors[None, :2], t=jnp.asarray(0))
+    return State(x=x, scenario=Goals(errors[None, :2]), t=jnp.asarray(0))
 
 
 def law(V, gains, errors):

@@ -27,8 +27,14 @@ if TYPE_CHECKING:
     from marlyap.errors import UserError as UserError
     from marlyap.evaluation import compare as compare, evaluate as evaluate
     from marlyap.fit import train as train
-    from marlyap.game import AbstractGame as AbstractGame
+    from marlyap.game import (
+        AbstractGame as AbstractGame,
+        AbstractRegulation as AbstractRegulation,
+        Tolerance as Tolerance,
+    )
     from marlyap.lyapunov_function import AbstractLyapunov as AbstractLyapunov
+    from marlyap.physics import AbstractPlant as AbstractPlant
+    from marlyap.planar import AbstractPlanar as AbstractPlanar, Goals as Goals
     from marlyap.rollout import Decentralised as Decentralised, rollout as rollout
     from marlyap.run import Run as Run
     from marlyap.tasks import Formation as Formation, Rendezvous as Rendezvous
@@ -53,7 +59,9 @@ PUBLIC = {
     "errors": ("UserError",),
     "evaluation": ("compare", "evaluate"),
     "fit": ("train",),
-    "game": ("AbstractGame",),
+    "game": ("AbstractGame", "AbstractRegulation", "Tolerance"),
+    "physics": ("AbstractPlant",),
+    "planar": ("AbstractPlanar", "Goals"),
     "lyapunov_function": ("AbstractLyapunov",),
     "rollout": ("Decentralised", "rollout"),
     "run": ("Run",),

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
+from marlyap.game import AbstractGame, AbstractRegulation
 from marlyap.identity import plain
 from marlyap.lyapunov_function import AbstractLyapunov
 from marlyap.perturb import Perturbed
@@ -113,12 +113,12 @@ class AbstractCertificate(eqx.Module):
     evidence: eqx.AbstractClassVar[Evidence]
     asks_V: ClassVar[bool] = False  # whether V is part of what is claimed
 
-    def refuse(self, game: AbstractGame, controller: Controller, V: AbstractLyapunov) -> None:
+    def refuse(self, game: AbstractRegulation, controller: Controller, V: AbstractLyapunov) -> None:
         """Raise UserError where this certificate is not about such a game, controller or V."""
 
     @abc.abstractmethod
     def check(
-        self, game: AbstractGame, controller: Controller, V: AbstractLyapunov, seed: int
+        self, game: AbstractRegulation, controller: Controller, V: AbstractLyapunov, seed: int
     ) -> Verdict:
         """Judge one controller. It does not raise when the controller fails.
 
@@ -127,12 +127,12 @@ class AbstractCertificate(eqx.Module):
 
 
 # The key is for what a certificate draws itself, such as one time of the rollout.
-Judge = Callable[[AbstractGame, AbstractLyapunov, Trajectory, Key], Judgement]
+Judge = Callable[[AbstractRegulation, AbstractLyapunov, Trajectory, Key], Judgement]
 
 
 @eqx.filter_jit
 def _roll(
-    game: AbstractGame, controller: Controller, key: Key, indices: Any, steps: int
+    game: AbstractRegulation, controller: Controller, key: Key, indices: Any, steps: int
 ) -> Trajectory:
     def one(index: Array) -> Trajectory:
         k_start, k_act = jax.random.split(jax.random.fold_in(key, index))
@@ -144,7 +144,7 @@ def _roll(
 @eqx.filter_jit
 def _judge(
     judge: Judge,
-    game: AbstractGame,
+    game: AbstractRegulation,
     V: AbstractLyapunov,
     seen: Trajectory,
     key: Key,
@@ -172,7 +172,7 @@ def _judge(
 
 def judged(
     judge: Judge,
-    game: AbstractGame,
+    game: AbstractRegulation,
     controller: Controller,
     V: AbstractLyapunov,
     seed: int,
@@ -200,19 +200,19 @@ def judged(
     return Found(**joined)
 
 
-def start_of(game: AbstractGame, seed: int, purpose: Purpose, episode: int) -> State:
+def start_of(game: AbstractRegulation, seed: int, purpose: Purpose, episode: int) -> State:
     """The start of one rollout: what a verdict's worst case names."""
     return _start(game, stream(seed, purpose), np.asarray(episode))
 
 
 @eqx.filter_jit
-def _start(game: AbstractGame, key: Key, episode: Any) -> State:
+def _start(game: AbstractRegulation, key: Key, episode: Any) -> State:
     k_start, _ = jax.random.split(jax.random.fold_in(key, episode))
     return game.reset(k_start)
 
 
 def worst_of(
-    game: AbstractGame, seed: int, purpose: Purpose, found: Found, among: Any = None
+    game: AbstractRegulation, seed: int, purpose: Purpose, found: Found, among: Any = None
 ) -> dict[str, Any]:
     """The rollout that failed worst, or came closest to failing, as a start to replay."""
     rivals = np.ones(len(found.holds), bool) if among is None else among
@@ -228,7 +228,7 @@ def worst_of(
         "episode": episode,
         "failed": not bool(found.holds[episode]),
         "badness": float(found.badness[episode]),
-        "state": {"x": np.asarray(start.x).tolist(), "goal": np.asarray(start.goal).tolist()},
+        "state": plain({"x": start.x, "scenario": start.scenario}),
         "figures": figures,
     }
 
@@ -278,7 +278,7 @@ def no_lyapunov(V: AbstractLyapunov, *founds: Found) -> str | None:
 
 def of_share(
     certificate: Any,
-    game: AbstractGame,
+    game: AbstractRegulation,
     V: AbstractLyapunov,
     seed: int,
     found: Found,
@@ -337,13 +337,15 @@ def arrival(game: AbstractGame) -> str:
     """`game.success` in words, also where a task has a definition of its own."""
     game = plain_game(game)
     if type(game).success is AbstractGame.success:
-        return arrived(game.radius)
+        return arrived(game.edge, game.unit)
     return f"success as {type(game).__name__}.success defines it"
 
 
-def arrived(radius: float) -> str:
+def arrived(edge: float, unit: str) -> str:
     """Success of a game that replaces nothing."""
-    return f"every agent within {radius:g} m of its goal"
+    if unit == "tolerance":
+        return "every error within its tolerance"
+    return f"every agent within {edge:g} {unit} of its goal"
 
 
 def limits(game: AbstractGame, steps: int, disturbance: str = "none") -> dict[str, Any]:
@@ -353,5 +355,6 @@ def limits(game: AbstractGame, steps: int, disturbance: str = "none") -> dict[st
         "horizon_steps": steps,
         "horizon_seconds": steps * game.dt,
         "disturbance": disturbance,
-        "radius": game.radius,
+        "edge": game.edge,
+        "unit": game.unit,
     }

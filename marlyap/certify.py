@@ -12,7 +12,7 @@ from marlyap.certificate import AbstractCertificate, Verdict
 from marlyap.certificates.information import information
 from marlyap.errors import UserError
 from marlyap.evaluation import drives
-from marlyap.game import AbstractGame
+from marlyap.game import AbstractRegulation
 from marlyap.identity import named_arrays, plain, policy_hash, without_arrays, words
 from marlyap.lyapunov_function import AbstractLyapunov, CostSum, cost_sum, require_zero
 from marlyap.rollout import Controller
@@ -25,7 +25,7 @@ KIND = "certificate"
 
 
 def certify(
-    game: AbstractGame,
+    game: AbstractRegulation,
     controller: Controller,
     certificates: Mapping[str, AbstractCertificate],
     seed: int,
@@ -98,7 +98,7 @@ def certify(
 
 def refused(
     certificates: Mapping[str, AbstractCertificate],
-    game: AbstractGame,
+    game: AbstractRegulation,
     controller: Controller,
     V: AbstractLyapunov,
     key: Key,
@@ -127,7 +127,7 @@ def why_not(check: Callable[[], None]) -> str | None:
 def save(
     directory: Path | str,
     result: Mapping[str, Any],
-    game: AbstractGame,
+    game: AbstractRegulation,
     controller: Controller,
     V: AbstractLyapunov | None = None,
     *,

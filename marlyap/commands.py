@@ -30,7 +30,7 @@ from marlyap.conformance import conformance
 from marlyap.controllers import CONTROLLERS, names_a_controller
 from marlyap.errors import UserError, within
 from marlyap.evaluation import RESTS, evaluate
-from marlyap.game import AbstractGame
+from marlyap.game import AbstractGame, regulated
 from marlyap.lyapunov_function import cost_sum
 from marlyap.recheck import recheck
 from marlyap.report import contents, episodes
@@ -354,11 +354,12 @@ def certification(args: Namespace, overrides: Overrides) -> Result:
         c = CERTIFICATES[name]
         several = rollouts is not None and "rollouts" in config.fields(c)
         chosen[name] = dataclasses.replace(c, rollouts=rollouts) if several else c  # pyright: ignore
+    game = regulated(game)
     V = cost_sum(game, controller, stream(args.seed, "calibrate"))
-    if V.ball > game.radius:
+    if V.ball > game.edge:
         say(
-            f"V ignores errors below {V.ball:g} m: started on the target, this controller drifts "
-            "that far."
+            f"V ignores errors below {V.ball:g} {V.unit}: started on the target, this controller "
+            "drifts that far."
         )
     tell = say if args.json else print
 
@@ -542,10 +543,10 @@ def summary(thing: Any) -> str:
     cls = thing if isinstance(thing, type) else type(thing)
     line = (cls.__doc__ or "").strip().splitlines()[0]
     if isinstance(thing, AbstractGame):
-        n, who = thing.agents, len(thing.leaders)
-        limits = " and ".join(f"{u:g}" for u in thing.dynamics.limits)
-        several = "s" * (who > 1)
-        line += f" ({n} agents, {who} leader{several}, {thing.graph} graph, limits {limits})"
+        n, who = thing.agents, len(thing.informed)
+        limits = " and ".join(f"{u:g}" for u in thing.plant.limits)
+        leaders = f", {who} leader{'s' * (who > 1)}" if who < n else ""
+        line += f" ({n} agents{leaders}, {thing.graph} graph, limits {limits})"
     elif isinstance(thing, AbstractAlgorithm) and (set_here := changes(thing)):
         line += f" ({', '.join(set_here)})"
     return line

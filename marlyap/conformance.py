@@ -17,16 +17,15 @@ from jaxtyping import Array
 
 from marlyap.controllers import UniformlyRandom
 from marlyap.errors import first_line, raised_at
-from marlyap.game import AbstractGame
-from marlyap.lyapunov_function import at_target
+from marlyap.game import AbstractGame, AbstractRegulation
 from marlyap.rollout import rollout
-from marlyap.types import Action, Key, Keys, State, Trajectory
+from marlyap.types import Action, Key, Keys, State, Trajectory, by_agent
 
 
 EPISODES, ROWS = 32, 64  # episodes played, and states examined in one call
 ENDS = [0, ROWS - 1]
 SOME = 16  # agents that are moved one by one, when there are more
-NUDGES = (1e-3, 0.3)  # by which they are moved (m)
+NUDGES = (1e-3, 0.3)  # by which they are moved, in the units of their states
 HALVINGS, LAST = 12, 3  # of the gap between two states, and those over which slopes are compared
 STEEPER = 1.5  # a slope that still grows this much in the last halvings has no bound
 LOOKAHEAD = 20  # steps that an early ending is held against: 1 / (1 - gamma) for gamma = 0.95
@@ -104,6 +103,8 @@ def see(game: AbstractGame, state: State, action: Action) -> dict[str, Any]:
         "distance": game.distance(state),
         "success": game.success(state),
         "violations": game.violations(state),
+        "failed": game.failed(state),
+        "hold": game.hold(state),
         "terminated": game.terminated(state),
         "linked": game.linked(state),
         "next": game.step(state, action),
@@ -122,8 +123,8 @@ def _play(game: AbstractGame, keys: Keys) -> Trajectory:
 
 
 @eqx.filter_jit
-def _rest(game: AbstractGame, states: State) -> State:
-    return jax.vmap(lambda s: at_target(game, s))(states)
+def _rest(game: AbstractRegulation, states: State) -> State:
+    return jax.vmap(game.at_target)(states)
 
 
 class Probe:
@@ -137,7 +138,8 @@ class Probe:
         self.game, self.traces, self.figures = game, 0, {}
         self.keys = jax.random.split(jax.random.key(seed), EPISODES)
         self.played = kept(_play(game, self.keys))
-        over = np.concatenate([np.zeros((EPISODES, 1), bool), self.played.terminated], 1)
+        ended = self.played.terminated | self.played.failed
+        over = np.concatenate([np.zeros((EPISODES, 1), bool), ended], 1)
         self.running = ~over[:, :-1]  # the episodes that had not ended before a step
         episode, time = np.nonzero(self.running)
         pick = np.linspace(0, len(time) - 1, ROWS).astype(int)
@@ -158,7 +160,8 @@ class Probe:
         return plain(self._look(game or self.game, *arrays))
 
     def target(self, states: State | None = None) -> State:
-        """The same scenes with every agent at rest where it has to be."""
+        """The same episodes on the target set, of a game that has one."""
+        assert isinstance(self.game, AbstractRegulation)
         arrays = jax.tree.map(jnp.asarray, states or self.states)
         return kept(_rest(self.game, arrays))
 
@@ -199,11 +202,39 @@ def plain(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: np.asarray(bits(leaf)), tree)
 
 
-def nudged(states: State, agent: Any, by: float, coordinate: Any = slice(None), what: str = "x"):
-    """`by` added to some coordinates of one agent, the same or another one in every row."""
-    value = np.array(getattr(states, what))
-    value[np.arange(len(value)), agent, coordinate] += by
-    return eqx.tree_at(lambda s: getattr(s, what), states, value)
+def nudged(
+    game: AbstractGame,
+    states: State,
+    agent: Any,
+    by: float,
+    coordinate: Any = slice(None),
+    what: str = "x",
+) -> State:
+    """`by` added to some numbers of one agent, the same or another one in every row.
+
+    `what` is the part of the state whose numbers about agents change: x or scenario.
+    """
+    part = getattr(states, what)
+    values = np.array(jax.vmap(lambda tree: by_agent(tree, game.agents)[0])(_numbers(part)))
+    values[np.arange(len(values)), agent, coordinate] += by
+    put = lambda tree, row: by_agent(tree, game.agents)[1](row)
+    new = eqx.combine(jax.vmap(put)(_numbers(part), jnp.asarray(values)), part)
+    return dataclasses.replace(states, **{what: kept(new)})
+
+
+def _numbers(tree: Any) -> Any:
+    """The floats of a tree as JAX arrays, and None for the rest."""
+    return jax.tree.map(jnp.asarray, eqx.filter(tree, _is_float))
+
+
+def _is_float(leaf: Any) -> bool:
+    return hasattr(leaf, "dtype") and not is_key(leaf) and jnp.issubdtype(leaf.dtype, jnp.inexact)
+
+
+def flat(tree: Any) -> np.ndarray:
+    """All numbers of each row of a batch, whole ones and keys too [row, number]."""
+    leaves = [leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(plain(tree))]
+    return np.concatenate(leaves, axis=1) if leaves else np.zeros((ROWS, 0))
 
 
 def rows(batch: Any, which: int | list[int]) -> Any:
@@ -224,7 +255,7 @@ def influence(
     before = probe.look(base, actions)
     moved = np.unique(np.linspace(0, game.agents - 1, min(game.agents, SOME)).astype(int))
     agents = np.resize(moved, ROWS)
-    after = probe.look(nudged(base, agents, by, what=what), actions)
+    after = probe.look(nudged(game, base, agents, by, what=what), actions)
     for k, j in enumerate(moved):
         if np.array_equal(before["linked"][k], after["linked"][k]):
             found[int(j)] = np.any(before[view][k] != after[view][k], axis=1)
@@ -245,9 +276,9 @@ def different(a: dict[str, Any], b: dict[str, Any], exact: bool = False) -> list
 
 def shapes(game: AbstractGame) -> Faults:
     """Fields have types, and arrays the shapes and types of the game's spaces."""
-    n, d = game.agents, game.dynamics
-    yield from _untyped(game)
-    yield from _untyped(d)
+    n = game.agents
+    yield from _untyped(type(game))
+    yield from _untyped(game.plant.moves)
     try:
         state = eqx.filter_eval_shape(game.reset, jax.random.key(0))
     except Exception as error:
@@ -255,28 +286,27 @@ def shapes(game: AbstractGame) -> Faults:
         return
     if not isinstance(state, State):
         kind = type(state).__name__
-        yield f"reset: it returns a {kind}; return State(x=..., goal=..., t=jnp.asarray(0))."
+        yield f"reset: it returns a {kind}; return State(x=..., scenario=..., t=jnp.asarray(0))."
         return
-    wrong = [
-        *_unlike("reset: x", state.x, (n, d.dx), "floating"),
-        *_unlike("reset: goal", state.goal, (n, 2), "floating"),
-        *_unlike("reset: t", state.t, (), "integer"),
-    ]
+    wrong = list(_caught(lambda: _wrong_state(game, state)))
     yield from wrong
     if wrong:
         return
-    action = jax.ShapeDtypeStruct((n, d.du), jnp.float32)
+    action = jax.ShapeDtypeStruct((n, game.du), jnp.float32)
+    errors = None if isinstance(game, AbstractRegulation) else 0
     links = jax.ShapeDtypeStruct((n, n), jnp.bool_)
     for name, arguments, shape, kind in (
         ("linked", (state,), (n, n), "bool"),
         ("observe", (state, links), (n, None), "floating"),
-        ("errors", (state,), (n, None), "floating"),
+        ("errors", (state,), (n, errors), "floating"),
         ("features", (state,), (n, None), "floating"),
         ("distance", (state,), (n,), "floating"),
         ("costs", (state, action), (n,), "floating"),
         ("cost", (state, action), (), "floating"),
         ("rewards", (state, action), (n,), "floating"),
         ("terminated", (state,), (), "bool"),
+        ("failed", (state,), (), "bool"),
+        ("hold", (state,), (n, game.du), "floating"),
         ("success", (state,), (), "bool"),
         ("violations", (state,), (n,), "bool"),
     ):
@@ -301,10 +331,26 @@ def shapes(game: AbstractGame) -> Faults:
             yield f"step: {name} becomes {_text(new)} from {_text(old)}; keep shape and type."
 
 
-def _untyped(thing: Any) -> Faults:
+def _wrong_state(game: AbstractGame, state: State) -> Faults:
+    """Parts of a start that have another shape or type than the game says."""
+    shapes = eqx.filter_eval_shape(
+        lambda s: {k: v[0] for k, v in game.state_shapes(s).items()}, state
+    )
+    wanted = {name: shape for name, (_, shape) in game.state_shapes(state).items()}
+    for name, found in shapes.items():
+        yield from _unlike(
+            f"reset: {name}", found, wanted[name], "integer" if name == "t" else "floating"
+        )
+    for path, leaf in jax.tree_util.tree_leaves_with_path((state.x, state.scenario)):
+        if jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.dtype != jnp.float32:
+            name = jax.tree_util.keystr(path)
+            yield f"reset: {name} is {_text(leaf)}; return float32, the precision of all else."
+
+
+def _untyped(thing: type) -> Faults:
     """Values in the body of a user's class that are no fields, for want of an annotation."""
     notes = lambda cls: vars(cls).get("__annotations__", {})
-    classes = type(thing).__mro__
+    classes = thing.__mro__
     shared = {k for c in classes for k, kind in notes(c).items() if "ClassVar" in str(kind)}
     for cls in classes:
         if cls.__module__.startswith("marlyap."):
@@ -388,7 +434,7 @@ def traced_once(probe: Probe) -> Faults:
     """An equal task, built anew, reuses the compiled code."""
     game = probe.game
     try:
-        twin = dataclasses.replace(game, dynamics=dataclasses.replace(game.dynamics))
+        twin = _anew(game)
     except Exception as error:
         yield f"fields: the constructor does not take them ({error}); leave __init__ to the fields."
         return
@@ -398,10 +444,16 @@ def traced_once(probe: Probe) -> Faults:
         yield "fields: an equal task is compiled again; use numbers, text, tuples, modules."
 
 
+def _anew(module: Any) -> Any:
+    """An equal module, built from its fields, those that are modules too."""
+    fields = {f.name: getattr(module, f.name) for f in dataclasses.fields(module) if f.init}
+    modules = {k: _anew(v) for k, v in fields.items() if isinstance(v, eqx.Module)}
+    return dataclasses.replace(module, **modules)
+
+
 def resets(probe: Probe) -> Faults:
     """Episodes start at step 0, differ, and do not depend on earlier ones."""
-    x = np.concatenate([probe.starts.x, probe.starts.goal], axis=2).reshape(EPISODES, -1)
-    if len(np.unique(x, axis=0)) < EPISODES:
+    if len(np.unique(flat((probe.starts.x, probe.starts.scenario)), axis=0)) < EPISODES:
         yield "reset: different keys gave the same start; draw it from the key."
     if np.any(probe.starts.t):
         yield f"reset: an episode starts at t = {int(probe.starts.t.max())}; start at 0."
@@ -413,11 +465,14 @@ def resets(probe: Probe) -> Faults:
 
 
 def clock(probe: Probe) -> Faults:
-    """A step adds 1 to t and leaves the goal where it is."""
+    """A step adds 1 to t and leaves the scenario as it is."""
     if np.any(probe.seen["next"].t != probe.states.t + 1):
         yield "step: t does not grow by 1; return t=state.t + 1."
-    if not np.array_equal(probe.seen["next"].goal, probe.states.goal):
-        yield "step: the goal moves within an episode; return goal=state.goal."
+    if not np.array_equal(flat(probe.seen["next"].scenario), flat(probe.states.scenario)):
+        yield (
+            "step: the scenario changes within an episode; return scenario=state.scenario, let a "
+            "reference follow from it and t, and put what else changes into x or memory."
+        )
 
 
 def local(probe: Probe) -> Faults:
@@ -429,10 +484,10 @@ def local(probe: Probe) -> Faults:
             for j, changed in influence(probe, row, by).items():
                 if np.any(changed & ~linked[:, j] & (everyone != j)):
                     told.add(f"agent {j}, which is not its neighbour")
-            for j, changed in influence(probe, row, by, what="goal").items():
+            for j, changed in influence(probe, row, by, what="scenario").items():
                 near = linked[:, j] | (everyone == j)
                 if np.any(changed & ~(near & leads[j])):
-                    told.add(f"the goal of agent {j}, which it must not know")
+                    told.add(f"the goal (scenario) of agent {j}, which it must not know")
     for what in sorted(told)[:1]:
         yield f"observe: a row changes with {what}; use local_view, slots and leads."
 
@@ -441,7 +496,7 @@ def links(probe: Probe) -> Faults:
     """observe takes neighbours from its argument links."""
     everyone = np.arange(probe.game.agents)
     for by in NUDGES:
-        for what in ("x", "goal"):
+        for what in ("x", "scenario"):
             found = influence(probe, ENDS[0], by, what=what, view="unlinked").items()
             for j, changed in found:
                 if np.any(changed & (everyone != j)):
@@ -461,31 +516,47 @@ def bounded_inputs(probe: Probe) -> Faults:
 
 
 def target(probe: Probe) -> Faults:
-    """On the target set errors are zero, success holds and agents at rest stay."""
+    """On the target set errors are zero and success holds; the holding action keeps it."""
+    if not isinstance(probe.game, AbstractRegulation):
+        return
     there = probe.target()
-    out = probe.look(there, 0 * probe.actions)
-    small = 1e-5 * (1 + np.abs(probe.states.x).max())
+    out = probe.look(there, probe.look(there, 0 * probe.actions)["hold"])
+    small = 1e-5 * (1 + np.abs(flat(_numbers(probe.states.x))).max())
     if not np.all(out["success"]):
         yield "success: it is false with every agent on its goal; return true there."
     if np.all(probe.seen["success"]):
         yield "success: it holds in every state that occurred; ask for all agents near their goals."
     if np.abs(out["errors"]).max() > small:
         yield "errors: they are not 0 with every agent at rest on its goal; measure from the goal."
-    moved = np.abs(out["next"].x - there.x).max()
-    if moved > small:
-        yield f"step: without an action agents at rest move by {moved:.2g}; make them stay."
+    after = kept(jax.tree.map(jnp.asarray, out["next"]))
+    moved = np.abs(probe.look(after, 0 * probe.actions)["errors"]).max()
+    if moved > 10 * small:
+        yield (
+            f"step: from the target set, under the holding action, the errors become {moved:.2g} "
+            "in a step; make agents at rest stay, or return in `hold` the action that keeps them."
+        )
     agents = np.resize(np.arange(probe.game.agents), ROWS)
-    for coordinate in (0, 1):
-        off = nudged(there, agents, 1e-2, coordinate)
-        seen = probe.look(off, 0 * probe.actions)
-        away = np.abs(seen["distance"] - out["distance"])[np.arange(ROWS), agents] > 1e-3
-        if np.any(away & ~np.any(np.abs(seen["errors"]) > small, axis=(1, 2))):
-            yield "errors: they are 0 beside the goal too; make them 0 on the target set only."
-            break
+    edge = probe.game.edge
+    for coordinate in range(_width(probe)):
+        for by in (1e-2, 10.0):
+            off = nudged(probe.game, there, agents, by, coordinate)
+            seen = probe.look(off, 0 * probe.actions)
+            away = np.abs(seen["distance"] - out["distance"])[np.arange(ROWS), agents] > 1e-2 * edge
+            if np.any(away & ~np.any(np.abs(seen["errors"]) > small, axis=(1, 2))):
+                yield "errors: they are 0 beside the goal too; make them 0 on the target set only."
+                return
+
+
+def _width(probe: Probe) -> int:
+    """How many numbers of an agent are in x."""
+    rows = by_agent(jax.tree.map(lambda x: x[0], _numbers(probe.states.x)), probe.game.agents)[0]
+    return rows.shape[1]
 
 
 def features(probe: Probe) -> Faults:
     """Features begin with the errors, agent by agent."""
+    if not isinstance(probe.game, AbstractRegulation):
+        return
     there = probe.look(probe.target(), 0 * probe.actions)
     for out in (probe.seen, there):
         errors, seen = out["errors"], out["features"]
@@ -501,8 +572,10 @@ def features(probe: Probe) -> Faults:
 
 def costs(probe: Probe) -> Faults:
     """Costs are at least 0, 0 on the target set, and the team's is their mean (Assumption 1)."""
-    cost = probe.seen["costs"]
-    there = probe.look(probe.target(), 0 * probe.actions)["costs"]
+    cost, there = probe.seen["costs"], np.zeros(1)
+    if isinstance(probe.game, AbstractRegulation):
+        goal = probe.target()
+        there = probe.look(goal, probe.look(goal, 0 * probe.actions)["hold"])["costs"]
     probe.figures |= {"largest": float(cost.max()), "on target": float(np.abs(there).max())}
     if cost.min() < 0 or there.min() < 0:
         yield f"costs: one is {min(cost.min(), there.min()):.3g}; make every cost >= 0."
@@ -550,7 +623,7 @@ def smooth_cost(probe: Probe) -> Faults:
 
 def smooth_step(probe: Probe) -> Faults:
     """The dynamics are Lipschitz in states and actions (Assumption 2)."""
-    before, last = _steepest(probe, lambda out: out["next"].x.reshape(ROWS, -1))
+    before, last = _steepest(probe, lambda out: flat(_numbers(out["next"].x)))
     probe.figures["slope"] = last
     if not last <= STEEPER * max(before, 1e-3):
         yield (
@@ -569,21 +642,26 @@ def _steepest(probe: Probe, f: Callable[[dict[str, Any]], Any]) -> tuple[float, 
     in sight. Half of the pairs are states of different episodes, the others end on the target set.
     """
     half, each = np.arange(ROWS) < ROWS // 2, np.arange(ROWS)
-    pick = lambda a, b: np.where(half[:, None, None], a, b)
     other = np.roll(each, ROWS // 2 - 1)
-    near = (probe.states.x, probe.actions)
-    far = (
-        pick(probe.states.x[other], probe.target().x),
-        pick(probe.actions[other], 0 * probe.actions),
-    )
+    near = (flat(_numbers(probe.states.x)), probe.actions)
+    far = (near[0][other], near[1][other])
+    if isinstance(probe.game, AbstractRegulation):
+        goal = probe.target()
+        hold = probe.look(goal, 0 * probe.actions)["hold"]
+        far = (
+            np.where(half[:, None], far[0], flat(_numbers(goal.x))),
+            np.where(half[:, None, None], far[1], hold),
+        )
+    back = _unflat(probe.states)
     size = lambda a: np.sqrt(np.sum(np.square(a.reshape(ROWS, -1).astype(float)), axis=1))
 
     def at(share: Any) -> tuple[Any, Any, Any]:
         """State, action and f at this share of the way from the near ends to the far ones."""
-        weight = share[:, None, None]
-        x, action = ((a + weight * (b - a)).astype(a.dtype) for a, b in zip(near, far, strict=True))
-        states = eqx.tree_at(lambda s: s.x, probe.states, x)
-        return x, action, f(probe.look(states, action)).astype(float)
+        weigh = lambda a: share.reshape(-1, *[1] * (a.ndim - 1)).astype(float)
+        x, action = (
+            (a + weigh(a) * (b - a)).astype(a.dtype) for a, b in zip(near, far, strict=True)
+        )
+        return x, action, f(probe.look(back(x), action)).astype(float)
 
     begin, quarter, slopes = np.zeros(ROWS), 0.25, []
     for _ in range(HALVINGS + 1):
@@ -599,6 +677,22 @@ def _steepest(probe: Probe, f: Callable[[dict[str, Any]], Any]) -> tuple[float, 
     return slopes[-1 - LAST], slopes[-1]
 
 
+def _unflat(states: State) -> Callable[[np.ndarray], State]:
+    """The states with other floats in x, given flat [row, number]."""
+    numbers = _numbers(states.x)
+    leaves, structure = jax.tree.flatten(numbers)
+    ends = np.cumsum([leaf[0].size for leaf in leaves])[:-1]
+
+    def back(x: np.ndarray) -> State:
+        parts = np.split(x, ends, axis=1)
+        new = [p.reshape(leaf.shape) for p, leaf in zip(parts, leaves, strict=True)]
+        return dataclasses.replace(
+            states, x=eqx.combine(jax.tree.unflatten(structure, new), states.x)
+        )
+
+    return back
+
+
 def time_limit(probe: Probe) -> Faults:
     """The time limit truncates; it neither terminates nor stops the dynamics."""
     if np.all(probe.played.terminated[:, 0]):
@@ -610,7 +704,7 @@ def time_limit(probe: Probe) -> Faults:
             "terminated: it depends on the time limit; leave time out of it, since the horizon "
             "truncates by itself."
         )
-    moves = lambda after, before: np.any(after.x != before.x, axis=(1, 2))
+    moves = lambda after, before: np.any(flat(after.x) != flat(before.x), axis=1)
     if np.any(moves(probe.seen["next"], probe.states) & ~moves(out["next"], late)):
         yield "step: nothing moves after the horizon; keep the dynamics independent of time."
 
@@ -643,6 +737,21 @@ def termination(probe: Probe) -> Faults:
         )
 
 
+def failure(probe: Probe) -> Faults:
+    """A failure costs more than the steps before it, so that failing never pays."""
+    played, game = probe.played, probe.game
+    episode, time = np.nonzero(probe.running & played.failed)
+    probe.figures["failed episodes"] = float(len(episode))
+    if len(episode):
+        before = float(played.cost.mean(axis=2)[episode, time].max())
+        probe.figures |= {"cost before": before, "failure cost": float(game.failure_cost)}
+        if not game.failure_cost >= before:
+            yield (
+                f"failure_cost: it is {game.failure_cost:g}, and a step before a failure costs "
+                f"{before:.3g}, so that failing pays; make it the larger of the two."
+            )
+
+
 LAWS: tuple[Callable[[Probe], Faults], ...] = (
     finite,
     deterministic,
@@ -663,4 +772,5 @@ LAWS: tuple[Callable[[Probe], Faults], ...] = (
     smooth_step,
     time_limit,
     termination,
+    failure,
 )

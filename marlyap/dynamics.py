@@ -1,17 +1,19 @@
-"""Dynamics of one agent in continuous time, xdot = f(x, u), and their integration (section 4).
+"""Dynamics of one planar agent, xdot = f(x, u) (section 4), and the plant of a team of them.
 
 The vector field is written once. Both integrators, the Lipschitz constant of Theorem 1 and
 every linearisation are derived from it.
 """
 
 import abc
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from marlyap.errors import UserError
+from marlyap.physics import AbstractPlant, Integrator, check_inputs, integrate
+from marlyap.types import Entry
 
 
 Position = Float[Array, "2"]
@@ -25,7 +27,7 @@ class AbstractDynamics(eqx.Module):
     """
 
     limits: eqx.AbstractVar[tuple[float, ...]]
-    integrator: eqx.AbstractVar[Literal["euler", "rk4"]]
+    integrator: eqx.AbstractVar[Integrator]
     names: eqx.AbstractClassVar[tuple[str, ...]]
     inputs: eqx.AbstractClassVar[tuple[str, ...]]
     blocks: eqx.AbstractClassVar[tuple[tuple[int, ...], ...]]
@@ -34,13 +36,7 @@ class AbstractDynamics(eqx.Module):
     felt: ClassVar[tuple[str, ...]] = ()
 
     def __check_init__(self):
-        if len(self.limits) != len(self.inputs) or not all(0 < u < 1e6 for u in self.limits):
-            raise UserError(
-                f"limits: {self.limits} must be {len(self.inputs)} positive numbers, "
-                f"the largest {' and '.join(self.inputs)}."
-            )
-        if self.integrator not in ("euler", "rk4"):
-            raise UserError(f"integrator: '{self.integrator}' must be euler or rk4.")
+        check_inputs(self.limits, self.inputs, self.integrator)
 
     @property
     def dx(self) -> int:
@@ -79,12 +75,9 @@ class AbstractDynamics(eqx.Module):
         x = jnp.zeros(self.dx).at[jnp.array([0, 1])].set(position)
         return x.at[2].set(angle) if "psi" in self.names else x
 
-    def step(
-        self, x: Float[Array, "dx"], action: Float[Array, "du"], dt: float
-    ) -> Float[Array, "dx"]:
-        """x_{t+1}: one step of `dt` seconds under a constant action in [-1, 1]^du."""
-        u = self.inputs_of(action)
-        return (semi_implicit_euler if self.integrator == "euler" else rk4)(self, x, u, dt)
+    def step(self, x: Float[Array, "dx"], u: Float[Array, "du"], dt: float) -> Float[Array, "dx"]:
+        """x after `dt` seconds of constant inputs u, in physical units."""
+        return integrate(lambda x: self.field(x, u), x, dt, self.integrator, self.blocks)
 
     def inputs_of(self, action: Float[Array, "du"]) -> Float[Array, "du"]:
         """The inputs, in physical units, that an action in [-1, 1]^du asks for."""
@@ -98,27 +91,6 @@ class AbstractDynamics(eqx.Module):
         return x
 
 
-def semi_implicit_euler(
-    f: AbstractDynamics, x: Float[Array, "dx"], u: Float[Array, "du"], dt: float
-) -> Float[Array, "dx"]:
-    """Velocities first, then what they move, each block with the values already new."""
-    for block in f.blocks:
-        rows = jnp.array(block)
-        x = x.at[rows].add(dt * f.field(x, u)[rows])
-    return x
-
-
-def rk4(
-    f: AbstractDynamics, x: Float[Array, "dx"], u: Float[Array, "du"], dt: float
-) -> Float[Array, "dx"]:
-    """The classical fourth-order Runge-Kutta step with the input held."""
-    k1 = f.field(x, u)
-    k2 = f.field(x + dt / 2 * k1, u)
-    k3 = f.field(x + dt / 2 * k2, u)
-    k4 = f.field(x + dt * k3, u)
-    return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-
-
 class Unicycle(AbstractDynamics):
     """The paper's unicycle: x, y (m), psi (rad), v (m/s), omega (rad/s); a (m/s^2), r (rad/s^2).
 
@@ -126,7 +98,7 @@ class Unicycle(AbstractDynamics):
     """
 
     limits: tuple[float, ...] = (5.0, 5.0)  # largest a (m/s^2) and r (rad/s^2)
-    integrator: Literal["euler", "rk4"] = "euler"
+    integrator: Integrator = "euler"
     names: ClassVar[tuple[str, ...]] = ("x", "y", "psi", "v", "omega")
     inputs: ClassVar[tuple[str, ...]] = ("a", "r")
     units: ClassVar[tuple[str, ...]] = ("m", "m", "rad", "m/s", "rad/s")
@@ -155,7 +127,7 @@ class Unicycle(AbstractDynamics):
         return x[4]
 
 
-class LateUnicycle(Unicycle):
+class LateUnicycle(AbstractDynamics):
     """A unicycle whose inputs act one step after they were asked for.
 
     Those under way, a (m/s^2) and r (rad/s^2), are part of its state, and it feels them: without
@@ -163,15 +135,41 @@ class LateUnicycle(Unicycle):
     system with a delay (Astrom and Wittenmark, Computer-Controlled Systems, 1997).
     """
 
+    limits: tuple[float, ...] = (5.0, 5.0)  # largest a (m/s^2) and r (rad/s^2)
+    integrator: Integrator = "euler"
     names: ClassVar[tuple[str, ...]] = (*Unicycle.names, "a", "r")
+    inputs: ClassVar[tuple[str, ...]] = Unicycle.inputs
     units: ClassVar[tuple[str, ...]] = (*Unicycle.units, *Unicycle.input_units)
+    input_units: ClassVar[tuple[str, ...]] = Unicycle.input_units
     felt: ClassVar[tuple[str, ...]] = ("v", "omega", "a", "r")
+    blocks: ClassVar[tuple[tuple[int, ...], ...]] = Unicycle.blocks
+
+    @property
+    def prompt(self) -> Unicycle:
+        """The unicycle whose inputs act at once."""
+        return Unicycle(self.limits, self.integrator)
 
     def field(self, x, u):
-        return jnp.concatenate([super().field(x[:5], x[5:]), jnp.zeros(2)])
+        return jnp.concatenate([self.prompt.field(x[:5], x[5:]), jnp.zeros(2)])
 
-    def step(self, x, action, dt):
-        return super().step(x, action, dt).at[5:].set(self.inputs_of(action))
+    def position(self, x):
+        return x[:2]
+
+    def heading(self, x):
+        return self.prompt.heading(x)
+
+    def velocity(self, x):
+        return self.prompt.velocity(x)
+
+    def rates(self, x):
+        return x[3:]
+
+    def turning(self, x):
+        return x[4]
+
+    def step(self, x, u, dt):
+        after = integrate(lambda x: self.field(x, u), x, dt, self.integrator, self.blocks)
+        return after.at[5:].set(u)
 
     def predict(self, x, dt):
         return self.step(x, jnp.zeros(2), dt)
@@ -181,7 +179,7 @@ class DoubleIntegrator(AbstractDynamics):
     """x, y (m), vx, vy (m/s), driven by an acceleration (m/s^2)."""
 
     limits: tuple[float, ...] = (5.0, 5.0)  # largest ax and ay (m/s^2)
-    integrator: Literal["euler", "rk4"] = "euler"
+    integrator: Integrator = "euler"
     names: ClassVar[tuple[str, ...]] = ("x", "y", "vx", "vy")
     inputs: ClassVar[tuple[str, ...]] = ("ax", "ay")
     units: ClassVar[tuple[str, ...]] = ("m", "m", "m/s", "m/s")
@@ -209,7 +207,7 @@ class SingleIntegrator(AbstractDynamics):
     """x, y (m), driven by a velocity (m/s)."""
 
     limits: tuple[float, ...] = (1.0, 1.0)  # largest vx and vy (m/s)
-    integrator: Literal["euler", "rk4"] = "euler"
+    integrator: Integrator = "euler"
     names: ClassVar[tuple[str, ...]] = ("x", "y")
     inputs: ClassVar[tuple[str, ...]] = ("vx", "vy")
     units: ClassVar[tuple[str, ...]] = ("m", "m")
@@ -238,3 +236,42 @@ DYNAMICS = {
     "double-integrator": DoubleIntegrator(),
     "single-integrator": SingleIntegrator(),
 }
+
+
+class Independent(AbstractPlant):
+    """The plant of agents that move on their own, all by the same dynamics."""
+
+    dynamics: AbstractDynamics
+    coupled: ClassVar[bool] = False
+
+    @property
+    def moves(self):
+        return type(self.dynamics)
+
+    limits = property(lambda self: self.dynamics.limits)  # pyright: ignore
+    integrator = property(lambda self: self.dynamics.integrator)  # pyright: ignore
+    blocks = property(lambda self: self.dynamics.blocks)  # pyright: ignore
+
+    @property
+    def states(self) -> tuple[Entry, ...]:  # pyright: ignore
+        d = self.dynamics
+        return entries(d.names, d.units, "world")
+
+    @property
+    def inputs(self) -> tuple[Entry, ...]:  # pyright: ignore
+        return entries(self.dynamics.inputs, self.dynamics.input_units, "own")
+
+    def field(self, x, u, scenario, time):
+        return jax.vmap(self.dynamics.field)(x, u)
+
+    def inputs_of(self, action):
+        return jax.vmap(self.dynamics.inputs_of)(action)
+
+    def step(self, x, u, scenario, time, dt):
+        return jax.vmap(lambda x, u: self.dynamics.step(x, u, dt))(x, u)
+
+
+def entries(names: tuple[str, ...], units: tuple[str, ...], frame: str) -> tuple[Entry, ...]:
+    """Names with units; "?" where a unit is not told."""
+    units = units or ("?",) * len(names)
+    return tuple(Entry(name, unit, frame) for name, unit in zip(names, units, strict=True))

@@ -1,5 +1,6 @@
 """How good is a controller? Fresh starts, deterministic policies, exact intervals."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,7 +18,7 @@ from marlyap.statistics import clopper_pearson, mcnemar
 from marlyap.types import Key, Keys, Scalar, State, Trajectory
 
 
-RADII = (0.05, 0.1, 0.15, 0.2, 0.3)  # m, for the success curve
+TIMES = (0.5, 1.0, 1.5, 2.0, 3.0)  # the edge of success, for the success curve
 HELD = 5  # steps over which `held` looks back
 REST = 0.1  # m/s and rad/s: an agent that moves and turns no faster is at rest
 RESTS = "comes to rest"  # said of a team that does
@@ -28,11 +29,12 @@ class Outcome(eqx.Module):
     """What is kept of one episode. One in which any number is not finite has failed."""
 
     success: Bool[Array, ""]  # `game.success` at the horizon
-    final: Scalar  # the worst agent's distance at the horizon (m); NaN where that is not finite
+    failed: Bool[Array, ""]  # `game.failed` at the horizon
+    final: Scalar  # the worst agent's distance at the horizon (`unit`); NaN where not finite
     held: Bool[Array, ""]  # success in each of the last five steps
     stayed: Bool[Array, ""]  # success from the horizon to the end of the rollout, in every step
-    speed: Scalar  # the fastest agent's speed at the horizon (m/s)
-    spin: Scalar  # the fastest agent's rate of turn at the horizon (rad/s)
+    speed: Scalar  # the fastest agent's speed past its goal at the horizon (m/s); 0 without a map
+    spin: Scalar  # the fastest agent's rate of turn at the horizon (rad/s); 0 without frames
     settled: Scalar  # the time from which success lasts until the horizon (s); inf if it does not
     violated: Bool[Array, ""]  # an agent broke a rule at some step until the horizon
     total: Scalar  # return until the horizon: the undiscounted sum of the team's rewards
@@ -41,33 +43,51 @@ class Outcome(eqx.Module):
 def outcome(game: AbstractGame, trajectory: Trajectory) -> Outcome:
     """Judge one episode of at least `game.horizon` steps; what lies beyond shows if it stays."""
     seen = until(trajectory, game.horizon)
-    last = jax.tree.map(lambda x: x[-1], seen.state)
+    before, last = (jax.tree.map(lambda x, k=k: x[k], seen.state) for k in (-2, -1))
+    speed, spin = motion(game, before, last)
     success = jax.vmap(game.success)(trajectory.state)
     inside = success[: game.horizon + 1]
     lasts = jnp.cumprod(inside[::-1])[::-1].astype(bool)
     sound = finite(seen)
     return Outcome(
         success=inside[-1] & sound,
+        failed=game.failed(last),
         final=jnp.where(sound, jnp.max(game.distance(last)), jnp.nan),
         held=jnp.all(inside[-HELD:]) & sound,
         stayed=jnp.all(success[game.horizon :]) & finite(trajectory),
-        speed=jnp.max(speeds(game, jax.tree.map(lambda x: x[-2], seen.state), last)),
-        spin=jnp.max(jnp.abs(jax.vmap(game.dynamics.turning)(last.x))),
+        speed=jnp.max(speed),
+        spin=jnp.max(spin),
         settled=jnp.where(lasts[-1] & sound, jnp.argmax(lasts) * game.dt, jnp.inf),
         violated=jnp.any(jax.vmap(game.violations)(seen.state)),
         total=jnp.sum(jnp.mean(seen.reward, axis=1)),
     )
 
 
-def speeds(game: AbstractGame, before: State, now: State) -> Float[Array, "agent"]:
-    """How fast each agent moves (m/s): what its state says, or how far the last step took it.
+def motion(
+    game: AbstractGame, before: State, now: State
+) -> tuple[Float[Array, "agent"], Float[Array, "agent"]]:
+    """How fast each agent moves past its goal (m/s) and turns (rad/s), by the game's scene.
 
-    The larger of the two, for a state need not hold the velocity (a point driven by it), and a task
-    may move its agents otherwise than their dynamics would.
+    Of a velocity the larger of what the state says and how far the last step went: a state need not
+    hold it, and a task may move its agents otherwise than their velocities say. An episode that has
+    ended stands still. Zero where there is no map, or no frame.
     """
-    told = jnp.linalg.norm(jax.vmap(game.dynamics.velocity)(now.x), axis=1)
-    went = jnp.linalg.norm(game.positions(now) - game.positions(before), axis=1) / game.dt
-    return jnp.maximum(told, went)
+    old, new = game.scene(before), game.scene(now)
+    still = jnp.zeros(game.agents)
+    if old is None or new is None:
+        return still, still
+    n = game.agents
+    gone = (new.position[:n] - old.position[:n]) / game.dt
+    past = jnp.zeros_like(gone)
+    if old.goal is not None and new.goal is not None:
+        past = (new.goal - old.goal) / game.dt
+    size = lambda v: jnp.linalg.norm(v, axis=1)
+    speed = jnp.maximum(size(new.velocity[:n] - past), size(gone - past))
+    spin = still if new.spin is None else jnp.abs(new.spin[:n])
+    if old.frame is None or new.frame is None:
+        return speed, spin
+    chord = jnp.sqrt(jnp.sum((new.frame[:n] - old.frame[:n]) ** 2, axis=(1, 2)) / 8)
+    return speed, jnp.maximum(spin, 2 * jnp.arcsin(jnp.minimum(chord, 1.0)) / game.dt)
 
 
 def episode(game: AbstractGame, controller: Controller, key: Key, beyond: int = 0) -> Trajectory:
@@ -101,7 +121,8 @@ class Evaluation(eqx.Module):
     """The outcomes of many episodes of one controller, as NumPy arrays of length `episodes`."""
 
     successes: Bool[np.ndarray, "episode"]  # at the horizon
-    final: Float[np.ndarray, "episode"]  # worst distance at the horizon (m)
+    failed: Bool[np.ndarray, "episode"]  # at the horizon
+    final: Float[np.ndarray, "episode"]  # worst distance at the horizon (`unit`)
     held: Bool[np.ndarray, "episode"]  # success in the last five steps
     stayed: Bool[np.ndarray, "episode"]  # success from the horizon until `beyond` steps after it
     speed: Float[np.ndarray, "episode"]  # largest at the horizon (m/s)
@@ -109,7 +130,9 @@ class Evaluation(eqx.Module):
     settled: Float[np.ndarray, "episode"]  # s; inf where it does not
     violated: Bool[np.ndarray, "episode"]  # a rule was broken until the horizon
     total: Float[np.ndarray, "episode"]  # return
-    radius: float  # m
+    edge: float  # the distance up to which an agent counts as arrived (`unit`)
+    unit: str
+    mapped: bool  # whether the game has a map: speeds and spins mean something
     beyond: int  # steps after the horizon over which `stayed` looks
 
     @property
@@ -123,23 +146,26 @@ class Evaluation(eqx.Module):
 
     def summary(self, confidence: float = 0.95) -> dict[str, Any]:
         """Plain numbers: rates with exact intervals, distances (m), times (s), speeds."""
-        within = [{"radius": r} | share(self.final <= r, confidence) for r in RADII]
-        return (
+        radii = [round(self.edge * k, 12) for k in TIMES]
+        within = [{"radius": r} | share(self.final <= r, confidence) for r in radii]
+        found = (
             share(self.successes, confidence)
-            | {"confidence": confidence, "radius": self.radius, "radii": within}
+            | {"confidence": confidence, "radius": self.edge, "unit": self.unit, "radii": within}
+            | {"failed": share(self.failed, confidence)}
             | {"held": share(self.held, confidence)}
-            | {"at_rest": share(self.at_rest, confidence)}
             | {"stayed": share(self.stayed, confidence), "beyond_steps": self.beyond}
             | {"violations": share(self.violated, confidence)}
             | {"final_distance": quantiles(self.final), "settling_time": quantiles(self.settled)}
-            | {"final_speed": quantiles(self.speed), "final_spin": quantiles(self.spin)}
             | {"return_mean": float(np.mean(self.total)), "rests": self.rests()}
         )
+        moving = {"final_speed": quantiles(self.speed), "final_spin": quantiles(self.spin)}
+        rest = {"at_rest": share(self.at_rest, confidence)} | moving
+        return found | (rest if self.mapped else {})
 
     def rests(self) -> str:
-        """What the agents do once they have arrived, in words; empty where nobody arrives."""
+        """What the agents do once they have arrived, in words; empty where none has, or no map."""
         moving = self.successes & ~self.at_rest
-        if not self.successes.any():
+        if not self.mapped or not self.successes.any():
             return ""
         if np.mean(moving[self.successes]) < 0.5:
             return RESTS
@@ -178,14 +204,20 @@ def evaluate(
             raise UserError(f"beyond: {beyond} steps is out of range; take 0 to 1000000.")
         out = outcomes(game, controller, keys, beyond)
     found = {k: np.asarray(v) for k, v in vars(out).items() if k != "success"}
-    return Evaluation(np.asarray(out.success), **found, radius=game.radius, beyond=beyond)
+    kind = {"edge": game.edge, "unit": game.unit, "mapped": mapped(game)}
+    return Evaluation(np.asarray(out.success), **found, **kind, beyond=beyond)
+
+
+def mapped(game: AbstractGame) -> bool:
+    """Whether the game has a map."""
+    return eqx.filter_eval_shape(lambda: game.scene(game.reset(jax.random.key(0)))) is not None
 
 
 def drives(game: AbstractGame, controller: Controller) -> None:
     """Raise UserError unless the controller returns an action [agents, inputs] for this game."""
     act = lambda key: controller(game.reset(key), key)
     shape = jax.numpy.shape(eqx.filter_eval_shape(act, jax.random.key(0)))
-    wanted = game.agents, game.dynamics.du
+    wanted = game.agents, game.du
     if shape != wanted:
         raise UserError(
             f"controller: it returns an action of shape {list(shape)}, and {type(game).__name__} "
@@ -199,10 +231,10 @@ def pooled(evaluations: Sequence[Evaluation]) -> Evaluation:
     Its intervals are about these very controllers. About the algorithm that trained them, or
     another training seed, they say nothing.
     """
-    names = [n for n in vars(evaluations[0]) if n not in ("radius", "beyond")]
-    stack = lambda name: np.concatenate([getattr(e, name) for e in evaluations])
-    first = evaluations[0]
-    return Evaluation(**{n: stack(n) for n in names}, radius=first.radius, beyond=first.beyond)
+    whole = lambda name: isinstance(getattr(evaluations[0], name), np.ndarray)
+    names = [name for name in vars(evaluations[0]) if whole(name)]
+    join = lambda name: np.concatenate([getattr(e, name) for e in evaluations])
+    return dataclasses.replace(evaluations[0], **{name: join(name) for name in names})
 
 
 def compare(a: Evaluation, b: Evaluation) -> dict[str, Any]:

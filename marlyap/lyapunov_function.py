@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
-from marlyap.nets import LyapunovNet, NormNet
+from marlyap.game import AbstractRegulation
+from marlyap.nets import NormNet
 from marlyap.rollout import Controller, rollout
 from marlyap.sensing import near
 from marlyap.types import Scalar, State, Trajectory
@@ -21,7 +21,7 @@ from marlyap.types import Scalar, State, Trajectory
 class AbstractLyapunov(eqx.Module):
     """V(s) >= 0. It has to fall by a share of c_rho(s), the mean of max(0, distance_i - rho)."""
 
-    ball: eqx.AbstractVar[float]  # rho (m)
+    ball: eqx.AbstractVar[float]  # rho, in the unit of the distance
 
     @property
     def meaning(self) -> str:
@@ -34,16 +34,16 @@ class AbstractLyapunov(eqx.Module):
         """How many steps past a state `along` has to see."""
 
     @abc.abstractmethod
-    def value(self, game: AbstractGame, state: State) -> Scalar:
+    def value(self, game: AbstractRegulation, state: State) -> Scalar:
         """V(s)."""
 
     @abc.abstractmethod
     def along(
-        self, game: AbstractGame, trajectory: Trajectory, time: int
+        self, game: AbstractRegulation, trajectory: Trajectory, time: int
     ) -> Float[Array, "{time}"]:
         """V of the first `time` states of a rollout with at least `beyond` states after them."""
 
-    def cost(self, game: AbstractGame, state: State) -> Scalar:
+    def cost(self, game: AbstractRegulation, state: State) -> Scalar:
         """c_rho(s)."""
         return jnp.mean(jax.nn.relu(game.distance(state) - self.ball))
 
@@ -56,11 +56,12 @@ class CostSum(AbstractLyapunov):
 
     controller: Controller  # deterministic, without memory
     T: int = 20  # steps
-    ball: float = 0.0  # rho (m)
+    ball: float = 0.0  # rho
+    unit: str = "m"  # of rho
 
     @property
     def meaning(self):
-        return f"the sum of the next {self.T} costs beyond {self.ball:g} m"
+        return f"the sum of the next {self.T} costs beyond {self.ball:g} {self.unit}"
 
     @property
     def beyond(self):
@@ -128,7 +129,7 @@ class Approach(AbstractLyapunov):
         return 0
 
     def value(self, game, state):
-        return jnp.sum(jax.vmap(lambda e: self.of(e, game.radius))(game.errors(state)))
+        return jnp.sum(jax.vmap(lambda e: self.of(e, game.edge))(game.errors(state)))
 
     def along(self, game, trajectory, time):
         return pointwise(self, game, trajectory, time)
@@ -167,53 +168,22 @@ class Norm(AbstractLyapunov):
         return pointwise(self, game, trajectory, time)
 
 
-class ActionValue(AbstractLyapunov):
-    """V(s) = L(s, mu(s)) of a trained `LyapunovNet` and a deterministic controller mu.
-
-    Nothing makes it zero on the target set; `require_zero` decides whether it may be used.
-    """
-
-    net: LyapunovNet
-    controller: Controller
-    ball: float = 0.0
-
-    @property
-    def meaning(self):
-        return "the learnt L(s, mu(s))"
-
-    @property
-    def beyond(self):
-        return 0
-
-    def value(self, game, state):
-        return self.net(game.features(state), self.controller(state, jax.random.key(0)))
-
-    def along(self, game, trajectory, time):
-        return pointwise(self, game, trajectory, time)
-
-
 def pointwise(
-    V: AbstractLyapunov, game: AbstractGame, trajectory: Trajectory, time: int
+    V: AbstractLyapunov, game: AbstractRegulation, trajectory: Trajectory, time: int
 ) -> Float[Array, "{time}"]:
     """V of each of the first `time` states on its own."""
     states = jax.tree.map(lambda leaf: leaf[:time], trajectory.state)
     return jax.vmap(lambda s: V.value(game, s))(states)
 
 
-def at_target(game: AbstractGame, state: State) -> State:
-    """The same episode with every agent at rest on its goal, headings as they were."""
-    angle = state.x[:, 2] if "psi" in game.dynamics.names else jnp.zeros(game.agents)
-    return eqx.tree_at(lambda s: s.x, state, jax.vmap(game.dynamics.rest)(state.goal, angle))
-
-
 @eqx.filter_jit
-def _values(V: AbstractLyapunov, game: AbstractGame, keys: Array) -> tuple[Array, Array]:
+def _values(V: AbstractLyapunov, game: AbstractRegulation, keys: Array) -> tuple[Array, Array]:
     starts = jax.vmap(game.reset)(keys)
     value = jax.vmap(lambda s: V.value(game, s))
-    return value(jax.vmap(lambda s: at_target(game, s))(starts)), value(starts)
+    return value(jax.vmap(lambda s: game.at_target(s))(starts)), value(starts)
 
 
-def require_zero(game: AbstractGame, V: AbstractLyapunov, key: Array) -> None:
+def require_zero(game: AbstractRegulation, V: AbstractLyapunov, key: Array) -> None:
     """Raise UserError unless V is 0 on the target set, to 1e-5 of what it is at the starts."""
     there, starts = _values(V, game, jax.random.split(key, 64))
     worst, usual = float(jnp.max(jnp.abs(there))), float(jnp.median(jnp.abs(starts)))
@@ -225,25 +195,25 @@ def require_zero(game: AbstractGame, V: AbstractLyapunov, key: Array) -> None:
         )
 
 
-def cost_sum(game: AbstractGame, controller: Controller, key: Array) -> CostSum:
+def cost_sum(game: AbstractRegulation, controller: Controller, key: Array) -> CostSum:
     """The T-step cost sum outside the smallest ball that the controller keeps from the target.
 
-    Learnt policies keep moving a little there: what counts is leaving the ball. Its radius (m) is
-    that of the game, or two or four times that; for a controller that drifts further the first, and
+    Learnt policies keep moving a little there: what counts is leaving the ball. Its radius is the
+    edge of success, or two or four times that; for a controller that drifts further the first, and
     `require_zero` refuses that V.
     """
-    V = CostSum(controller=controller, ball=game.radius)
+    V = CostSum(controller=controller, ball=game.edge, unit=game.unit)
     drift = float(_furthest(V, game, jax.random.split(key, 64)))
-    balls = [game.radius * 2**k for k in range(3)]
+    balls = [game.edge * 2**k for k in range(3)]
     return eqx.tree_at(lambda v: v.ball, V, next((b for b in balls if drift <= b), balls[0]))
 
 
 @eqx.filter_jit
-def _furthest(V: CostSum, game: AbstractGame, keys: Array) -> Scalar:
-    """How far any agent gets from its goal within T steps from rest on it (m)."""
+def _furthest(V: CostSum, game: AbstractRegulation, keys: Array) -> Scalar:
+    """How far any agent gets from its goal within T steps from the target set."""
 
     def one(key: Array) -> Scalar:
-        start = at_target(game, game.reset(key))
+        start = game.at_target(game.reset(key))
         seen = rollout(game, V.controller, start, jax.random.key(0), V.T)
         return jnp.max(jax.vmap(game.distance)(seen.state))
 

@@ -12,12 +12,13 @@ from jaxtyping import Array, Bool, Float, Int
 from marlyap import graph as graphs
 from marlyap.dynamics import AbstractDynamics
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
+from marlyap.game import AbstractGame, AbstractRegulation
+from marlyap.physics import AbstractPlant
 from marlyap.seeds import branch
 from marlyap.types import State
 
 
-class Perturbed(AbstractGame):
+class Perturbed(AbstractRegulation):
     """`inner` with stronger or weaker inputs, noise, delay, lost messages, agents or edges.
 
     A controller made for `inner` drives it unchanged. Every method of `inner` is asked, with the
@@ -31,7 +32,7 @@ class Perturbed(AbstractGame):
     own about the whole team, which cannot leave an agent out.
     """
 
-    inner: AbstractGame
+    inner: AbstractRegulation
     gain: float | Array = 1.0  # the inputs have this many times their nominal effect
     noise: float | Array = 0.0  # standard deviation of what is added to each action in [-1, 1]
     delay: int = 0  # steps until an action has its effect; until then there is none
@@ -48,6 +49,11 @@ class Perturbed(AbstractGame):
         missing = {*self.gone, *(i for edge in self.cut for i in edge)}
         if not missing <= set(range(self.inner.agents)):
             raise UserError(f"perturbation: {sorted(missing)} names an agent that is not there.")
+        if self.gone and self.inner.plant.coupled:
+            raise UserError(
+                f"perturbation: an agent of {type(self.inner).__name__} cannot be taken away, "
+                "since its plant couples the agents; leave out gone."
+            )
         own = judges_as_a_team(self.inner)
         if self.gone and own:
             raise UserError(
@@ -57,9 +63,7 @@ class Perturbed(AbstractGame):
 
     # What the game inside says.
     agents = property(lambda self: self.inner.agents)  # pyright: ignore[reportAssignmentType]
-    leaders = property(lambda self: self.inner.leaders)  # pyright: ignore[reportAssignmentType]
     graph = property(lambda self: self.inner.graph)  # pyright: ignore[reportAssignmentType]
-    radius = property(lambda self: self.inner.radius)  # pyright: ignore[reportAssignmentType]
     dt = property(lambda self: self.inner.dt)  # pyright: ignore[reportAssignmentType]
     horizon = property(lambda self: self.inner.horizon)  # pyright: ignore[reportAssignmentType]
 
@@ -74,13 +78,18 @@ class Perturbed(AbstractGame):
         return getattr(self.inner, name)
 
     @property
-    def plant(self) -> AbstractGame:
+    def driven(self) -> AbstractGame:
         """The game inside, with inputs as strong as they are here."""
         return self.inner.strengthened(self.gain) if _on(self.gain - 1) else self.inner
 
     @property
+    def plant(self) -> AbstractPlant:
+        return self.driven.plant
+
+    @property
     def dynamics(self) -> AbstractDynamics:
-        return self.plant.dynamics
+        """Of a planar game."""
+        return self.driven.dynamics  # pyright: ignore
 
     @property
     def present(self) -> Bool[np.ndarray, "agent"]:
@@ -100,17 +109,19 @@ class Perturbed(AbstractGame):
     def inside(self, state: State) -> State:
         """The state as the game inside knows it."""
         memory = state.memory["inner"]
-        return State(x=state.x, goal=state.goal, t=state.t, memory=memory)
+        return State(x=state.x, scenario=state.scenario, t=state.t, memory=memory)
 
     def reset(self, key):
         start = self.inner.reset(key)
-        x = start.x.at[:, :2].multiply(self.spread)
+        if _on(self.spread - 1):
+            start = self.inner.farther(start, self.spread)
         seed = branch(key, "perturb")
         for _ in range(depth(self.inner)):  # nested perturbations draw other numbers
             seed = jax.random.fold_in(seed, 3)
-        queue = jnp.zeros((self.delay, self.agents, self.dynamics.du))
+        idle = self.inner.hold(start)
+        queue = jnp.broadcast_to(idle, (self.delay, *idle.shape))
         memory = {"seed": jax.random.key_data(seed), "queue": queue, "inner": start.memory}
-        return State(x=x, goal=start.goal, t=start.t, memory=memory)
+        return State(x=start.x, scenario=start.scenario, t=start.t, memory=memory)
 
     def linked(self, state):
         linked = self.inner.linked(self.inside(state)) & jnp.asarray(self.adjacency)
@@ -130,9 +141,14 @@ class Perturbed(AbstractGame):
         now, key = queue[0], jax.random.fold_in(self._key(state, 2), state.t)
         if _on(self.noise):
             now = now + self.noise * jax.random.normal(key, now.shape)
-        after = self.plant.step(self.inside(state), now)
+        after = self.driven.step(self.inside(state), now)
         memory = state.memory | {"queue": queue[1:], "inner": after.memory}
-        return State(x=after.x, goal=after.goal, t=after.t, memory=memory)
+        return State(x=after.x, scenario=after.scenario, t=after.t, memory=memory)
+
+    def outside(self, inside: State, state: State) -> State:
+        """A state of the game inside, with what this one remembers in `state`."""
+        memory = state.memory | {"inner": inside.memory}
+        return State(x=inside.x, scenario=inside.scenario, t=inside.t, memory=memory)
 
     def features(self, state):
         return self.inner.features(self.inside(state))
@@ -140,11 +156,59 @@ class Perturbed(AbstractGame):
     def terminated(self, state):
         return self.inner.terminated(self.inside(state))
 
+    def failed(self, state):
+        return self.inner.failed(self.inside(state))
+
+    @property
+    def failure_cost(self):
+        return self.inner.failure_cost
+
+    @property
+    def edge(self):
+        return self.inner.edge
+
+    @property
+    def unit(self):
+        return self.inner.unit
+
+    @property
+    def tolerances(self):
+        return self.inner.tolerances
+
+    @property
+    def leads(self):
+        return self.inner.leads
+
+    @property
+    def kinds(self):
+        return self.inner.kinds
+
+    def error_entries(self):
+        return self.inner.error_entries()
+
+    def hold(self, state):
+        return self.inner.hold(self.inside(state))
+
+    def at_target(self, state):
+        return self.outside(self.inner.at_target(self.inside(state)), state)
+
+    def farther(self, state, factor):
+        return self.outside(self.inner.farther(self.inside(state), factor), state)
+
+    def aside(self, state, gone):
+        return self.outside(self.inner.aside(self.inside(state), gone), state)
+
+    def scene(self, state):
+        return self.inner.scene(self.inside(state))
+
+    def signals(self, state):
+        return self.inner.signals(self.inside(state))
+
+    def resized(self, agents):
+        return dataclasses.replace(self, inner=self.inner.resized(agents))
+
     def positions(self, state):
         return self.inner.positions(self.inside(state))
-
-    def motion(self, state):
-        return self._of_those_present(self.inner.motion(self.inside(state)))
 
     def distance(self, state):
         return self._of_those_present(self.inner.distance(self.inside(state)))
@@ -163,9 +227,8 @@ class Perturbed(AbstractGame):
         return super().success(state) if self.gone else self.inner.success(self.inside(state))
 
     def violations(self, state):
-        away = jnp.where(jnp.asarray(self.present), 0.0, 1e4 * (1 + jnp.arange(self.agents)))
-        x = state.x.at[:, :2].add(away[:, None])  # nobody collides with an agent that is gone
-        there = self.inner.violations(self.inside(eqx.tree_at(lambda s: s.x, state, x)))
+        # Nobody collides with an agent that is gone.
+        there = self.inner.violations(self.inner.aside(self.inside(state), ~self.present))
         return there & jnp.asarray(self.present)
 
     def _of_those_present(self, values: Float[Array, "agent"]) -> Float[Array, "agent"]:
@@ -184,7 +247,7 @@ def judges_as_a_team(game: AbstractGame) -> tuple[str, str] | None:
     """The task and its own method that judges all agents together, if it replaces one."""
     if isinstance(game, Perturbed):
         return judges_as_a_team(game.inner)
-    for name in ("success", "terminated"):
+    for name in ("success", "terminated", "failed"):
         if getattr(type(game), name) is not getattr(AbstractGame, name):
             return type(game).__name__, name
     return None
@@ -214,5 +277,5 @@ def edge_to_cut(game: AbstractGame) -> tuple[int, int] | None:
 
 def follower_to_lose(game: AbstractGame) -> int | None:
     """The last agent that is no leader, if any."""
-    others = [i for i in range(game.agents) if i not in game.leaders]
-    return others[-1] if others else None
+    others = np.flatnonzero(~game.leads)
+    return int(others[-1]) if len(others) else None

@@ -66,21 +66,35 @@ def rollout(
 ) -> Trajectory:
     """Drive the game from `start` for `steps` steps (default: its horizon).
 
-    Once the game has terminated its state stands still.
+    Once the game has terminated or failed its state stands still.
     """
 
     def tick(state, key):
         action = controller(state, key)
         moved = game.step(state, action)
-        ended = game.terminated(state)
-        after = jax.tree.map(lambda old, new: jnp.where(ended, old, new), state, moved)
-        reward, cost = game.rewards(state, action), game.costs(state, action)
-        return after, (after, action, reward, cost, game.terminated(after))
+        ended = game.terminated(state) | game.failed(state)
+        after = jax.tree.map(lambda old, new: _where(ended, old, new), state, moved)
+        cost, reward = charged(game, state, action)
+        return after, (after, action, reward, cost, game.terminated(after), game.failed(after))
 
     keys = jax.random.split(key, steps or game.horizon)
-    _, (after, action, reward, cost, terminated) = jax.lax.scan(tick, start, keys)
+    _, (after, action, reward, cost, terminated, failed) = jax.lax.scan(tick, start, keys)
     states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, after)
-    return Trajectory(action=action, reward=reward, cost=cost, state=states, terminated=terminated)
+    return Trajectory(action, reward, cost, states, terminated, failed)
+
+
+def charged(
+    game: AbstractGame, state: State, action: Action
+) -> tuple[Float[Array, "agent"], Float[Array, "agent"]]:
+    """What a step from this state costs and earns each agent: after a failure, `failure_cost`."""
+    failed, price = game.failed(state), game.failure_cost
+    cost = jnp.where(failed, price, game.costs(state, action))
+    return cost, jnp.where(failed, -price, game.rewards(state, action))
+
+
+def _where(ended: Bool[Array, ""], old: Array, new: Array) -> Array:
+    """`old` once ended; random keys too, of which jnp.where takes none."""
+    return jax.lax.select(jnp.broadcast_to(ended, old.shape), old, new)
 
 
 def cost_to_go(

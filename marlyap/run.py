@@ -289,7 +289,7 @@ def _fits(policy: Policy, game: AbstractGame) -> bool:
         action = eqx.filter_eval_shape(act, jax.random.key(0))
     except (TypeError, ValueError):
         return False
-    return action.shape == (game.agents, game.dynamics.du)
+    return action.shape == (game.agents, game.du)
 
 
 def begin(trainer: Trainer, seed: int) -> Carry:

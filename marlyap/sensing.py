@@ -4,22 +4,12 @@ A turn or a shift of the whole scene changes nothing (SE(2) invariance), and not
 agent itself and its neighbours enters (locality).
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from marlyap.dynamics import AbstractDynamics
-from marlyap.types import Obs, State
-
-
-class Entry(NamedTuple):
-    """One number of an observation, a state or an action: enough to build it elsewhere."""
-
-    name: str
-    unit: str  # 1 where it has none
-    frame: str  # own: the agent's own axes; world; or nothing, where no axis is meant
+from marlyap.types import Entry, Links, Obs
 
 
 def into_frame(h: Float[Array, "2"], v: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
@@ -40,9 +30,10 @@ def near(v: Float[Array, "*n 2"], scale: float) -> Float[Array, "*n 2"]:
 
 def body_frame(
     dynamics: AbstractDynamics,
-    state: State,
+    x: Float[Array, "agent dx"],
+    goals: Float[Array, "agent 2"],
     slots: Int[Array, "agent slot"],
-    linked: Bool[Array, "agent agent"],
+    links: Links,
     leads: Bool[Array, "agent"],
     scale: float,
     headings: bool,
@@ -53,20 +44,20 @@ def body_frame(
     Positions are given in metres and again magnified near zero, at `scale` metres. Empty slots
     are all zero.
     """
-    p = jax.vmap(dynamics.position)(state.x)
-    h = jax.vmap(dynamics.heading)(state.x)
-    v = jax.vmap(dynamics.velocity)(state.x)
-    rates = jax.vmap(dynamics.rates)(state.x)
+    p = jax.vmap(dynamics.position)(x)
+    h = jax.vmap(dynamics.heading)(x)
+    v = jax.vmap(dynamics.velocity)(x)
+    rates = jax.vmap(dynamics.rates)(x)
 
     def of(i, slot, lead):
-        there = (slot >= 0) & linked[i, slot]
+        there = (slot >= 0) & links[i, slot]
         gap = into_frame(h[i], p[slot] - p[i][None])
         seen = [gap, near(gap, scale), into_frame(h[i], v[slot])]
         if headings:
             seen.append(into_frame(h[i], h[slot]))
         flag = there.astype(p.dtype)[:, None]
         others = jnp.where(there[:, None], jnp.concatenate([flag, *seen], axis=1), 0.0)
-        to_goal = jnp.where(lead, into_frame(h[i], state.goal[i] - p[i]), 0.0)
+        to_goal = jnp.where(lead, into_frame(h[i], goals[i] - p[i]), 0.0)
         own = [rates[i], lead.astype(p.dtype)[None], to_goal, near(to_goal, scale)]
         return jnp.concatenate([*own, others.ravel()])
 
@@ -95,11 +86,34 @@ def body_frame_entries(dynamics: AbstractDynamics, slots: int, headings: bool) -
     return (*own, *others)
 
 
-def goal_errors(dynamics: AbstractDynamics, state: State) -> Float[Array, "agent error"]:
-    """Per agent: goal - p_i in its own frame and its rates; all zero exactly on the target set."""
+def beside(
+    own: Float[Array, "agent own"],
+    seen: Float[Array, "agent agent edge"],
+    slots: Int[Array, "agent slot"],
+    links: Links,
+) -> Obs:
+    """What agent i knows of itself, and of each neighbour: for the observations of any game.
 
-    def of(x, goal):
-        to_goal = into_frame(dynamics.heading(x), goal - dynamics.position(x))
-        return jnp.concatenate([to_goal, dynamics.rates(x)])
+    Row i is own[i], then for every neighbour slot j of i a presence flag and seen[i, j], all zero
+    where i does not hear j.
 
-    return jax.vmap(of)(state.x, state.goal)
+    Arguments: own, each agent's own measurements; seen, of agent j as i sees it; slots, as
+    `game.slots`; links, as `observe` is given them.
+    """
+    row = jnp.arange(slots.shape[0])[:, None]
+    there = (slots >= 0) & links[row, slots]
+    flagged = jnp.concatenate([jnp.ones_like(seen[..., :1]), seen], axis=-1)[row, slots]
+    others = jnp.where(there[..., None], flagged, 0.0)
+    return jnp.concatenate([own, others.reshape(slots.shape[0], -1)], axis=1)
+
+
+def beside_entries(
+    own: tuple[Entry, ...], seen: tuple[Entry, ...], slots: int
+) -> tuple[Entry, ...]:
+    """What the entries of one row of `beside` are; {j} in a name stands for the neighbour."""
+    found = list(own)
+    for k in range(slots):
+        who = f"neighbour {k}"
+        found.append(Entry(f"1 if {who} is seen, else all of it is 0"))
+        found += [Entry(e.name.replace("{j}", who), e.unit, e.frame) for e in seen]
+    return tuple(found)

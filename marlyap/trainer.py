@@ -82,7 +82,7 @@ def shape(game: AbstractGame) -> Shape:
     state = eqx.filter_eval_shape(game.reset, jax.random.key(0))
     see = lambda s: (game.observations(s), game.features(s), game.errors(s))
     obs, features, errors = eqx.filter_eval_shape(see, state)
-    return Shape(game.agents, obs.shape[1], features.shape[1], errors.shape[1], game.dynamics.du)
+    return Shape(game.agents, obs.shape[1], features.shape[1], errors.shape[1], game.du)
 
 
 class Trainer(eqx.Module):
@@ -112,7 +112,7 @@ class Trainer(eqx.Module):
     def begin(self, key: Key) -> Carry:
         """A fresh learner, and a memory with the warm-up in it."""
         k_init, k_warm, key = jax.random.split(key, 3)
-        s, random = self.schedule, Uniform(self.game.dynamics.du)
+        s, random = self.schedule, Uniform(self.game.du)
         learner = self.algorithm.init(shape(self.game), k_init)
         remembers = isinstance(self.algorithm, AbstractOffPolicy)
         episodes = max(1, -(-s.warmup // self.game.horizon)) if remembers else 1
@@ -192,9 +192,9 @@ class Trainer(eqx.Module):
         keys = spread(jax.random.split(stream(0, "select"), self.schedule.judge_episodes))
         seen = outcomes(self.game, Decentralised(policy, self.game), keys)
         rate = lambda hits: jnp.mean(hits.astype(float))
-        near = rate(seen.success & (seen.final <= self.game.radius / 2))
+        near = rate(seen.success & (seen.final <= self.game.edge / 2))
         less = lambda x, unit: jnp.mean(jnp.nan_to_num(1 / (1 + x / unit)))
-        tie = less(seen.final, self.game.radius) + less(seen.speed + seen.spin, 1.0)
+        tie = less(seen.final, self.game.edge) + less(seen.speed + seen.spin, 1.0)
         score = rate(seen.success) + 0.1 * near + 0.02 * tie / self.schedule.judge_episodes
         better = score >= carry.score
         keep = lambda new, old: jnp.where(better, new, old) if eqx.is_array(new) else new

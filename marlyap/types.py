@@ -1,11 +1,18 @@
 """The pytrees that cross the seams, each for one sample; a batch is made by `jax.vmap`.
 
 Axis names used throughout: `agent`, `time`, `dx` (state of one agent), `du` (input of one
-agent), `obs` (what one agent sees), `feature` (what the central critic sees of one agent).
+agent), `obs` (what one agent sees), `feature` (what the central critic sees of one agent),
+`body` (what is drawn in space, agents first), `d` (dimensions of that space).
 """
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import jaxtyping
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 
@@ -16,15 +23,37 @@ Action = Float[Array, "agent du"]
 Obs = Float[Array, "agent obs"]
 Links = Bool[Array, "agent agent"]
 Features = Float[Array, "agent feature"]
+Rows = Callable[[Float[Array, "agent number"]], PyTree]
+
+
+class Entry(NamedTuple):
+    """One number of an observation, a state, an action or an error: enough to rebuild it."""
+
+    name: str
+    unit: str = "1"  # 1 where it has none
+    frame: str = ""  # own: the agent's own axes; world; empty where no axis is meant
 
 
 class State(eqx.Module):
-    """Everything the game knows at one instant."""
+    """Everything a game knows at one instant; an episode can be replayed from its first state.
 
-    x: Float[Array, "agent dx"]  # physical state of each agent, SI units, radians
-    goal: Float[Array, "agent 2"]  # where each agent has to be (m); fixed within an episode
+    `x` and `scenario` are the game's own pytrees. What is about agents has the agent axis first.
+    """
+
+    x: PyTree  # what the plant moves, in the units of `plant.states`
+    scenario: PyTree  # drawn by `reset`, constant in an episode: goals, loads, parameters, a key
     t: Int[Array, ""]  # steps since the start
-    memory: PyTree = None  # what else a game carries from step to step (delays, past observations)
+    memory: PyTree = None  # what else is carried from step to step: inputs under way, past values
+
+
+class Scene(eqx.Module):
+    """Bodies in space, agents first: for films, proximity graphs, speeds and distances."""
+
+    position: Float[Array, "body d"]  # m; d is 1 (a road), 2 or 3
+    velocity: Float[Array, "body d"]  # m/s
+    frame: Float[Array, "body d d"] | None = None  # rows: the body's own axes
+    goal: Float[Array, "agent d"] | None = None  # m; None where no place has to be reached
+    spin: Float[Array, "body"] | None = None  # rad/s; None where the state does not hold it
 
 
 class Transition(eqx.Module):
@@ -57,3 +86,25 @@ class Trajectory(eqx.Module):
     cost: Float[Array, "time agent"]
     state: State  # leaves have a leading axis time + 1
     terminated: Bool[Array, "time"]  # the game ended at or before the end of this step
+    failed: Bool[Array, "time"]  # the game failed at or before the end of this step
+
+
+def by_agent(tree: PyTree, agents: int) -> tuple[Float[Array, "agent number"], Rows]:
+    """The floats in the tree that are about agents, a row for each, and the way back.
+
+    About agents is every array of floats whose first axis is as long as the team.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    about = [
+        k for k, x in enumerate(leaves) if eqx.is_inexact_array(x) and x.shape[:1] == (agents,)
+    ]
+    flat = [leaves[k].reshape(agents, -1) for k in about]
+    ends = np.cumsum([x.shape[1] for x in flat])[:-1]
+
+    def put(rows: Float[Array, "agent number"]) -> PyTree:
+        new = list(leaves)
+        for k, part in zip(about, jnp.split(rows, ends, axis=1) if about else [], strict=True):
+            new[k] = part.reshape(leaves[k].shape)
+        return jax.tree.unflatten(structure, new)
+
+    return jnp.concatenate(flat, axis=1) if flat else jnp.zeros((agents, 0)), put

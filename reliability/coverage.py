@@ -41,9 +41,9 @@ from marlyap.certificates.robustness import Robustness
 from marlyap.certificates.safety import Apart, Safe
 from marlyap.certificates.theorem1 import Theorem1, _Tuple
 from marlyap.dynamics import AbstractDynamics, SingleIntegrator
-from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import CostSum
 from marlyap.perturb import Perturbed, traced
+from marlyap.planar import AbstractPlanar, Goals
 from marlyap.provenance import provenance
 from marlyap.statistics import (
     iqm,
@@ -181,7 +181,7 @@ ASKED = 0.9  # confidence of each certificate
 TRUTH = 1_000_000  # seed of the rollouts that the truth is known from
 
 
-class Ray(AbstractGame):
+class Ray(AbstractPlanar):
     """Points that keep their bearing from the goal, which alone says how fast they come or go.
 
     x_{t+1} = (1 - rate(bearing)) x_t + dt u, so that where a point is at any time is closed-form.
@@ -198,7 +198,7 @@ class Ray(AbstractGame):
 
     def reset(self, key):
         x = jax.random.uniform(key, (self.agents, 2), minval=-1.0, maxval=1.0)
-        return State(x=x, goal=jnp.zeros((self.agents, 2)), t=jnp.asarray(0))
+        return State(x=x, scenario=Goals(jnp.zeros((self.agents, 2))), t=jnp.asarray(0))
 
     def observe(self, state, links):
         return state.x
@@ -207,7 +207,7 @@ class Ray(AbstractGame):
         bearing = jnp.arctan2(state.x[:, 1], state.x[:, 0]) / (2 * jnp.pi) + 0.5
         rate = self.slowest + 0.27 * bearing[:, None]
         x = (1 - rate) * state.x + 0.05 * self.dt * action
-        return State(x=x, goal=state.goal, t=state.t + 1, memory=state.memory)
+        return State(x=x, scenario=state.scenario, t=state.t + 1, memory=state.memory)
 
     def violations(self, state):
         return self.crowded(state, 0.02)
@@ -243,7 +243,7 @@ KINDS: dict[str, AbstractCertificate] = {
 }
 
 
-def seen(judge: Any, steps: int, rollouts: int, game: AbstractGame = GAME) -> Found:
+def seen(judge: Any, steps: int, rollouts: int, game: AbstractPlanar = GAME) -> Found:
     """What a certificate's judge makes of very many rollouts."""
     return judged(judge, game, IDLE, V, TRUTH, "certify", rollouts, steps)
 
@@ -305,7 +305,7 @@ def truths(rollouts: int) -> dict[str, Callable[[Verdict], bool]]:
     }
 
 
-def perturbed(change: dict[str, Any]) -> AbstractGame:
+def perturbed(change: dict[str, Any]) -> AbstractPlanar:
     return traced(Perturbed(inner=GAME, **change))
 
 

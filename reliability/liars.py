@@ -42,9 +42,9 @@ from marlyap.controllers.pursuit import TreePursuit
 from marlyap.dynamics import DoubleIntegrator, SingleIntegrator
 from marlyap.errors import UserError
 from marlyap.evaluation import evaluate
-from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import AbstractLyapunov, Approach
 from marlyap.nets import Actors, Greedy
+from marlyap.planar import AbstractPlanar, Goals
 from marlyap.recheck import recheck
 from marlyap.rollout import Decentralised
 from marlyap.tasks import Formation, Rendezvous
@@ -79,7 +79,7 @@ def case(kind: str, name: str, honest: bool = False) -> Callable:
 
 
 def verdicts(
-    game: AbstractGame,
+    game: AbstractPlanar,
     controller: Any,
     certificate: Any,
     V: AbstractLyapunov | None = None,
@@ -107,7 +107,7 @@ def refused(call: Callable[[], Any]) -> Answer:
     return Answer(True, "was let pass")
 
 
-def law(game: AbstractGame, name: str) -> Answer:
+def law(game: AbstractPlanar, name: str) -> Answer:
     """What `check-task` says of one law."""
     faults = [f for found in conformance(game) if found.law == name for f in found.faults or ()]
     return Answer(not faults, faults[0] if faults else f"keeps the law {name}")
@@ -125,11 +125,11 @@ class Plant(Rendezvous):
 
     def reset(self, key):
         x = jax.random.uniform(key, (self.agents, 2), minval=-self.size, maxval=self.size)
-        return State(x=x, goal=jnp.zeros((self.agents, 2)), t=jnp.asarray(0))
+        return State(x=x, scenario=Goals(jnp.zeros((self.agents, 2))), t=jnp.asarray(0))
 
     def step(self, state, action):
         u = 2.0 * jnp.clip(action, -1.0, 1.0)
-        return State(x=self.growth * state.x + self.dt * u, goal=state.goal, t=state.t + 1)
+        return State(x=self.growth * state.x + self.dt * u, scenario=state.scenario, t=state.t + 1)
 
 
 class Push(eqx.Module):
@@ -141,8 +141,8 @@ class Push(eqx.Module):
     limit: float = 2.0
 
     def __call__(self, state, key):
-        u = self.gain * (state.goal - state.x[:, :2]) + self.bias
-        u = jnp.where(state.t < self.until, u, state.x[:, :2] - state.goal + 0.3)
+        u = self.gain * (state.scenario.goal - state.x[:, :2]) + self.bias
+        u = jnp.where(state.t < self.until, u, state.x[:, :2] - state.scenario.goal + 0.3)
         return jnp.clip(u / self.limit, -1.0, 1.0)
 
 
@@ -187,7 +187,7 @@ class Unstable(Rendezvous):
 
     def step(self, state, action):
         after = super().step(state, action)
-        x = after.x.at[:, :2].add(1.5 * (after.x[:, :2] - state.goal))
+        x = after.x.at[:, :2].add(1.5 * (after.x[:, :2] - state.scenario.goal))
         return eqx.tree_at(lambda s: s.x, after, x)
 
 
@@ -195,7 +195,9 @@ class Brake(eqx.Module):
     """A damped spring to the goal for double integrators."""
 
     def __call__(self, state, key):
-        return jnp.clip((4 * (state.goal - state.x[:, :2]) - 4 * state.x[:, 2:]) / 5, -1, 1)
+        return jnp.clip(
+            (4 * (state.scenario.goal - state.x[:, :2]) - 4 * state.x[:, 2:]) / 5, -1, 1
+        )
 
 
 @case("linearisation", "a damped spring on double integrators", honest=True)
@@ -215,7 +217,7 @@ class Holonomic(Rendezvous):
 
     def step(self, state, action):
         x = state.x.at[:, :2].add(0.4 * jnp.clip(action, -1, 1)).at[:, 3:].set(0.0)
-        return State(x=x, goal=state.goal, t=state.t + 1)
+        return State(x=x, scenario=state.scenario, t=state.t + 1)
 
 
 @case("linearisation", "'no feedback is exponential' of robots that its own step moves sideways")
@@ -335,7 +337,7 @@ class Circle(eqx.Module):
     """Drives round the goal, 0.12 m away."""
 
     def __call__(self, state, key):
-        e = state.x[:, :2] - state.goal
+        e = state.x[:, :2] - state.scenario.goal
         r = jnp.linalg.norm(e, axis=1, keepdims=True) + 1e-9
         u = 5 * (0.12 - r) * e / r + jnp.stack([-e[:, 1], e[:, 0]], axis=1)
         return jnp.clip(u / 2, -1, 1)
@@ -430,14 +432,14 @@ class Told(eqx.Module):
     """Every follower reads the target, which only the leader is told."""
 
     def __call__(self, state, key):
-        return jnp.clip(1.5 * (state.goal - state.x), -1, 1)
+        return jnp.clip(1.5 * (state.scenario.goal - state.x), -1, 1)
 
 
 class Stranger(eqx.Module):
     """Agent 2 follows agent 0, to which it is not linked."""
 
     def __call__(self, state, key):
-        to = jnp.stack([state.goal[0], state.x[0], state.x[0]])
+        to = jnp.stack([state.scenario.goal[0], state.x[0], state.x[0]])
         return jnp.clip(1.5 * (to - state.x), -1, 1)
 
 
@@ -445,7 +447,7 @@ class Clock(eqx.Module):
     """Everybody drives to a neighbour, and waits in every other step."""
 
     def __call__(self, state, key):
-        to = jnp.stack([state.goal[0], state.x[0], state.x[1]])
+        to = jnp.stack([state.scenario.goal[0], state.x[0], state.x[1]])
         return jnp.where(state.t % 2 == 0, jnp.clip(1.5 * (to - state.x), -1, 1), 0.0)
 
 
@@ -453,11 +455,11 @@ class Local(eqx.Module):
     """Each follows the agent before it on the path; the leader knows the target."""
 
     def __call__(self, state, key):
-        to = jnp.stack([state.goal[0], state.x[0], state.x[1]])
+        to = jnp.stack([state.scenario.goal[0], state.x[0], state.x[1]])
         return jnp.clip(1.5 * (to - state.x), -1, 1)
 
 
-def policy(game: AbstractGame, joint: bool = False) -> Decentralised:
+def policy(game: AbstractPlanar, joint: bool = False) -> Decentralised:
     """Untrained weights, large enough to act."""
     size = shape(game)
     size = size._replace(obs=size.agents * size.obs) if joint else size
@@ -524,7 +526,7 @@ class Wired(Rendezvous):
 
     def step(self, state, action):
         x = state.x.at[:, :2].add(0.1 * jnp.clip(action, -1, 1))
-        return State(x=x, goal=state.goal, t=state.t + 1)
+        return State(x=x, scenario=state.scenario, t=state.t + 1)
 
 
 for game, name, words in (
@@ -602,7 +604,7 @@ class Squint(Rendezvous):
         return 1.1 * super().observe(state, links)
 
 
-def proof(game: AbstractGame) -> Answer:
+def proof(game: AbstractPlanar) -> Answer:
     number = lambda x: jnp.asarray(x, jnp.float32)
     form = Approach(*map(number, (0.3, 1.0, 0.5, 2.0, 0.2, 0.05, 0.1)))
     region = Proof(c=1.0, rho=0.1, inner=0.1, half=(1.0, 1.0, 1.0, 1.0), most=64)

@@ -35,11 +35,11 @@ from marlyap.certify import certify, save
 from marlyap.controllers.point_offset import PointOffset
 from marlyap.dynamics import AbstractDynamics, DoubleIntegrator, SingleIntegrator, Unicycle
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
 from marlyap.identity import policy_hash
 from marlyap.lyapunov_function import Approach, CostSum, Norm, Quadratic, cost_sum
 from marlyap.nets import Actors, Greedy, NormNet, Shape
 from marlyap.perturb import Perturbed
+from marlyap.planar import AbstractPlanar, Goals
 from marlyap.rollout import Decentralised
 from marlyap.statistics import lower_bound
 from marlyap.tasks.formation import Formation
@@ -47,7 +47,7 @@ from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State
 
 
-class Flow(AbstractGame):
+class Flow(AbstractPlanar):
     """One point in the plane, s_{t+1} = A s_t + cubic (s_t)^3 in its first coordinate."""
 
     A: jax.Array
@@ -62,14 +62,14 @@ class Flow(AbstractGame):
 
     def reset(self, key):
         x = jax.random.uniform(key, (1, 2), minval=-2.0, maxval=2.0)
-        return State(x=x, goal=jnp.zeros((1, 2)), t=jnp.asarray(0))
+        return State(x=x, scenario=Goals(jnp.zeros((1, 2))), t=jnp.asarray(0))
 
     def observe(self, state, links):
         return state.x
 
     def step(self, state, action):
         x = state.x @ self.A.T + self.cubic * state.x**3 * jnp.array([[1.0, 0.0]])
-        return State(x=x, goal=state.goal, t=state.t + 1)
+        return State(x=x, scenario=state.scenario, t=state.t + 1)
 
 
 class Idle(eqx.Module):
@@ -85,11 +85,11 @@ class Scripted(eqx.Module):
     broken: jax.Array = eqx.field(default_factory=lambda: jnp.asarray(0.0))
 
     def __call__(self, state, key):
-        to_goal = state.goal - state.x
+        to_goal = state.scenario.goal - state.x
         action = jnp.where(state.t >= self.leave, -to_goal - 0.3, 4.0 * to_goal)
         turned = jnp.stack([-to_goal[:, 1], to_goal[:, 0]], axis=1)
         action = jnp.where(self.spin > 0, turned, action)
-        return jnp.where(state.goal[0, 0] > 1 - 2 * self.broken, jnp.nan, action)
+        return jnp.where(state.scenario.goal[0, 0] > 1 - 2 * self.broken, jnp.nan, action)
 
 
 N = 600
@@ -212,7 +212,7 @@ class Straying(eqx.Module):
     off: jax.Array
 
     def __call__(self, state, key):
-        return 4.0 * (state.goal + jnp.array([[1.0, 0.0]]) * self.off - state.x)
+        return 4.0 * (state.scenario.goal + jnp.array([[1.0, 0.0]]) * self.off - state.x)
 
 
 def test_a_ball_is_taken_that_the_controller_keeps():
@@ -411,7 +411,7 @@ class Near(Flow):
 
     def reset(self, key):
         state = super().reset(key)
-        return State(x=state.x * self.start / 2, goal=state.goal, t=state.t)
+        return State(x=state.x * self.start / 2, scenario=state.scenario, t=state.t)
 
 
 @pytest.mark.parametrize(
@@ -499,7 +499,7 @@ def test_perturbations_that_cannot_be_applied_are_named():
 
     few = Robustness(400, (0.5,), (), (), (), (), share=0.9)
     game = Judged(agents=2, graph="path", dynamics=SingleIntegrator())
-    verdict = few.check(game, lambda s, k: s.goal - s.x, CostSum(Idle()), 0)
+    verdict = few.check(game, lambda s, k: s.scenario.goal - s.x, CostSum(Idle()), 0)
     assert "without agent 1" in verdict.figures["without"]
     assert "(left out: without agent 1, because an agent of Judged" in verdict.claim
     assert (
@@ -548,12 +548,12 @@ class Holonomic(Rendezvous):
     """Robots called unicycles that its own step moves straight to the goal, by 0.6 a step."""
 
     def step(self, state, action):
-        p = state.goal + 0.6 * (state.x[:, :2] - state.goal)
+        p = state.scenario.goal + 0.6 * (state.x[:, :2] - state.scenario.goal)
         x = jnp.concatenate([p, 0.6 * state.x[:, 2:]], axis=1)
-        return State(x=x + 0.0 * jnp.sum(action), goal=state.goal, t=state.t + 1)
+        return State(x=x + 0.0 * jnp.sum(action), scenario=state.scenario, t=state.t + 1)
 
     def errors(self, state):
-        return jnp.concatenate([state.x[:, :2] - state.goal, state.x[:, 2:]], axis=1)
+        return jnp.concatenate([state.x[:, :2] - state.scenario.goal, state.x[:, 2:]], axis=1)
 
     def reset(self, key):
         start = super().reset(key)
@@ -588,7 +588,7 @@ def test_the_linearisation_asks_for_an_equilibrium_that_does_not_move():
     moving = Drifting(jnp.eye(2) * 0.5, jnp.asarray(0.0))
     verdict = Linearisation().check(moving, Idle(), CostSum(Idle()), 0)
     assert not verdict.holds and "without an action the agents move" in verdict.claim
-    kinked = lambda state, key: -3.0 * jnp.abs(state.x - state.goal)
+    kinked = lambda state, key: -3.0 * jnp.abs(state.x - state.scenario.goal)
     verdict = Linearisation().check(POINT, kinked, CostSum(Idle()), 0)
     assert not verdict.holds and "no derivative" in verdict.claim
 
@@ -600,20 +600,20 @@ class Meeting(Flow):
 
     def reset(self, key):
         x = jax.random.normal(key, (2, 2))
-        return State(x=x, goal=jnp.zeros((2, 2)), t=jnp.asarray(0))
+        return State(x=x, scenario=Goals(jnp.zeros((2, 2))), t=jnp.asarray(0))
 
     def errors(self, state):
         return state.x - state.x[::-1]
 
     def step(self, state, action):
         x = state.x + 0.1 * (action - jnp.mean(action, axis=0, keepdims=True))
-        return State(x=x, goal=state.goal, t=state.t + 1)
+        return State(x=x, scenario=state.scenario, t=state.t + 1)
 
 
 def test_an_eigenvalue_along_the_target_set_is_harmless():
     """No input moves the mean of the two, and no error sees it: nothing is impossible."""
     game = Meeting(jnp.eye(2), jnp.asarray(0.0))
-    verdict = Linearisation().check(game, lambda s, k: -(s.x - s.goal), CostSum(Idle()), 0)
+    verdict = Linearisation().check(game, lambda s, k: -(s.x - s.scenario.goal), CostSum(Idle()), 0)
     assert verdict.figures["controllability_rank"] == 2 and not verdict.holds
     assert verdict.figures["uncontrollable_eigenvalues"] == []
     assert verdict.evidence == "observed" and "no stability is shown" in verdict.claim
@@ -736,7 +736,9 @@ def test_the_bounds_of_the_unicycle_hold_at_random_points(kind):
     @eqx.filter_jit
     def truth(x):
         state = State(
-            x=jnp.array([[0.0, 0.0, 0.0, x[2], x[3]]]), goal=x[None, :2], t=jnp.asarray(0)
+            x=jnp.array([[0.0, 0.0, 0.0, x[2], x[3]]]),
+            scenario=Goals(x[None, :2]),
+            t=jnp.asarray(0),
         )
         later = game.step(state, controller(state, jax.random.key(0)))
         return game.errors(later)[0], V.value(game, state)[None], V.value(game, later)[None]
@@ -764,7 +766,7 @@ def steady(state, key):
 def test_safe_counts_rollouts_in_which_a_rule_is_broken():
     points = dict(agents=2, leaders=(0, 1), dynamics=SingleIntegrator((2.0, 2.0)))
     few = Safe(rollouts=N, share=0.8)
-    meets = few.check(Rules(**points), lambda s, k: s.goal - s.x, CostSum(Idle()), 0)
+    meets = few.check(Rules(**points), lambda s, k: s.scenario.goal - s.x, CostSum(Idle()), 0)
     assert not meets.holds and meets.successes == 0 and meets.worst["failed"]
     still = few.check(Rules(**points, gap=0.2), steady, CostSum(Idle()), 0)
     # Two points uniform in a square of side 2 are closer than r with probability pi r^2 / 4, less
@@ -790,7 +792,7 @@ def test_apart_finds_the_gap_and_tests_it_on_fresh_starts():
     gap = verdict.figures["gap"]
     assert verdict.holds and 0.3 < gap < 0.6 and f"closer than {gap:g} m" in verdict.claim
     meets = Apart(rollouts=N, calibration=N).check(
-        Rules(**points), lambda s, k: s.goal - s.x, CostSum(Idle()), 0
+        Rules(**points), lambda s, k: s.scenario.goal - s.x, CostSum(Idle()), 0
     )
     assert not meets.holds and "less than the 0.01 m asked" in meets.claim
     with pytest.raises(UserError, match="team of one"):
@@ -801,11 +803,15 @@ PATH = Rendezvous(graph="path", dynamics=SingleIntegrator())  # 0 leads, 2 is li
 PATH_OBS = PATH.observations(PATH.reset(jax.random.key(0))).shape[1]
 
 
+def goal(state):
+    return state.scenario.goal
+
+
 def local(state):
     """Everybody goes to the mean of itself and its neighbours, the leader to its goal."""
     x, link = state.x, jnp.asarray(np.eye(3) + PATH.adjacency, jnp.float32)
     pull = link @ x / jnp.sum(link, axis=1, keepdims=True) - x
-    return pull.at[0].add(state.goal[0] - x[0])
+    return pull.at[0].add(goal(state)[0] - x[0])
 
 
 @pytest.mark.parametrize(
@@ -813,8 +819,8 @@ def local(state):
     [
         (local, "each agent acts on itself and its neighbours"),
         (lambda s: local(s) * (1.0 - (s.t > 80)), "agent 0's action changes with the time"),
-        (lambda s: s.goal - s.x, "agent 1's action changes with the target that it is not told"),
-        (lambda s: local(s) + s.goal[1:2], "agent 0's action changes with the target of agent 1"),
+        (lambda s: goal(s) - s.x, "agent 1's action changes with the target that it is not told"),
+        (lambda s: local(s) + goal(s)[1:2], "agent 0's action changes with the target of agent 1"),
         (lambda s: local(s).at[0].add(s.x[2]), "agent 0's action changes with agent 2, which"),
     ],
 )  # fmt: skip

@@ -105,7 +105,7 @@ class StepChangesAType(Sound):
 class StepAddsMemory(Sound):
     def step(self, state, action):
         after = super().step(state, action)
-        return State(x=after.x, goal=after.goal, t=after.t, memory=action)
+        return State(x=after.x, scenario=after.scenario, t=after.t, memory=action)
 
 
 @breaks("shapes", "costs: it raised TracerBoolConversionError.*use jnp.where")
@@ -222,7 +222,9 @@ class TimeStandsStill(Sound):
 @breaks("clock", "step: the goal moves within an episode")
 class GoalMoves(Sound):
     def step(self, state, action):
-        return eqx.tree_at(lambda s: s.goal, super().step(state, action), state.goal + 0.01)
+        return eqx.tree_at(
+            lambda s: s.scenario.goal, super().step(state, action), state.scenario.goal + 0.01
+        )
 
 
 @breaks("local", "observe: a row changes with agent [02], which is not its neighbour")
@@ -236,7 +238,9 @@ class EverybodySeesEverybody(Sound):
 @breaks("local", "observe: a row changes with the goal of agent 1, which it must not know")
 class FollowersSeeTheirGoal(Sound):
     def observe(self, state, links):
-        return jnp.concatenate([super().observe(state, links), state.goal - state.x], axis=1)
+        return jnp.concatenate(
+            [super().observe(state, links), state.scenario.goal - state.x], axis=1
+        )
 
 
 @breaks("links", "observe: without links a row still changes with agent 0")
@@ -248,7 +252,7 @@ class LinksAreIgnored(Sound):
 @breaks("bounded_inputs", "step: an action of 4 does more than one of 1")
 class UnboundedActions(Sound):
     def step(self, state, action):
-        return State(x=state.x + self.dt * action, goal=state.goal, t=state.t + 1)
+        return State(x=state.x + self.dt * action, scenario=state.scenario, t=state.t + 1)
 
 
 @breaks("target", "success: it is false with every agent on its goal")
@@ -272,7 +276,7 @@ class ErrorsFromTheOrigin(Sound):
 @breaks("target", "errors: they are 0 beside the goal too")
 class ErrorsOfOneAxis(Sound):
     def errors(self, state):
-        return (state.x - state.goal) * jnp.array([[1.0, 0.0]])
+        return (state.x - state.scenario.goal) * jnp.array([[1.0, 0.0]])
 
 
 @breaks("target", "step: without an action agents at rest move by 0.01")
@@ -544,7 +548,7 @@ def test_a_typed_random_key_in_the_state_is_legal():
         def reset(self, key):
             k_start, k_noise = jax.random.split(key)
             start = super().reset(k_start)
-            return State(x=start.x, goal=start.goal, t=start.t, memory=k_noise)
+            return State(x=start.x, scenario=start.scenario, t=start.t, memory=k_noise)
 
         def step(self, state, action):
             after = super().step(state, action)

@@ -447,10 +447,10 @@ from marlyap.tasks import Rendezvous
 
 class Poisoned(Rendezvous):
     bad: str = "costs"  # costs or observe
-    edge: float = 9.0  # targets beyond this are bad (m)
+    far: float = 9.0  # targets beyond this are bad (m)
 
     def poison(self, state, value, what):
-        return jnp.where((self.bad == what) & (state.goal[0, 0] > self.edge), jnp.nan, value)
+        return jnp.where((self.bad == what) & (self.goals(state)[0, 0] > self.far), jnp.nan, value)
 
     def observe(self, state, links):
         return self.poison(state, super().observe(state, links), "observe")
@@ -471,7 +471,7 @@ def test_nan_from_a_users_task_is_named_and_the_last_checkpoint_is_intact(
 ):
     monkeypatch.setattr(FIT, "PATIENCE", 0.0)
     monkeypatch.setattr(FIT, "SHARE", 1e9)
-    command = ["train", own, "masac", "--out", "out", *TINY, "--task.edge", "0.6"]
+    command = ["train", own, "masac", "--out", "out", *TINY, "--task.far", "0.6"]
     err = refused(
         capsys, *command, parts=["the task returned a number", "(seed 0)", "correct the task"]
     )
@@ -496,13 +496,13 @@ def test_nan_from_a_users_task_is_named_and_the_last_checkpoint_is_intact(
 
 
 def test_nan_in_the_warm_up_is_blamed_on_the_task(own, capsys):
-    command = ["train", own, "masac", "--out", "out", *TINY, "--task.edge", "0.6"]
+    command = ["train", own, "masac", "--out", "out", *TINY, "--task.far", "0.6"]
     refused(capsys, *command, "--seeds", "3", parts=["the task returned a number"])
 
 
 def test_nan_in_what_a_task_observes_is_named_in_the_warm_up(own, tmp_path, capsys):
     command = ["train", own, "masac", "--out", "out", *TINY]
-    bad = ["--task.bad", "observe", "--task.edge", "-9"]
+    bad = ["--task.bad", "observe", "--task.far", "-9"]
     refused(capsys, *command, *bad, parts=["obs: the task returned", "in the warm-up (seed 0)"])
     assert not (tmp_path / "out").exists()
 

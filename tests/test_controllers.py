@@ -61,7 +61,7 @@ def distances(game, controller, episodes):
 def test_an_agent_uses_only_what_it_may_know(name):
     state = moving(STRONG)
     others = [eqx.tree_at(lambda s: s.x, state, state.x.at[j].add(0.3)) for j in range(5)]
-    blind = eqx.tree_at(lambda s: s.goal, state, state.goal.at[1:].add(7.0))
+    blind = eqx.tree_at(lambda s: s.scenario.goal, state, state.goal.at[1:].add(7.0))
     out = np.asarray(act_all(CONTROLLERS[name](STRONG), batch([state, *others, blind])))
     for j in range(5):
         for i in range(5):
@@ -77,7 +77,7 @@ def test_a_turn_and_a_shift_of_the_scene_change_nothing(name):
         c, s = np.cos(angle), np.sin(angle)
         turn = lambda p: p @ jnp.array([[c, s], [-s, c]]) + shift[None]
         x = jnp.concatenate([turn(state.x[:, :2]), state.x[:, 2:3] + angle, state.x[:, 3:]], axis=1)
-        return State(x=x, goal=turn(state.goal), t=state.t)
+        return State(x=x, scenario=Goals(turn(state.scenario.goal)), t=state.t)
 
     states = [moving(PATH, 3)]
     states += [moved(states[0], a, jnp.array([0.3, -0.4])) for a in (0.5, 2.0, -1.3, np.pi)]
@@ -88,7 +88,7 @@ def test_a_turn_and_a_shift_of_the_scene_change_nothing(name):
 @every_law
 def test_actions_are_bounded_and_finite_everywhere(name):
     state = PATH.reset(KEY)
-    there = jax.vmap(PATH.dynamics.rest)(state.goal, jnp.linspace(-3, 3, 5))
+    there = jax.vmap(PATH.dynamics.rest)(state.scenario.goal, jnp.linspace(-3, 3, 5))
     at_goal = eqx.tree_at(lambda s: s.x, state, there)
     far = eqx.tree_at(lambda s: s.x, moving(PATH), 1e3 * moving(PATH, 2).x)
     wild = [moving(PATH, s) for s in range(4)]
@@ -101,7 +101,7 @@ def test_actions_are_bounded_and_finite_everywhere(name):
 @every_law
 def test_proximity_graphs_leave_a_lonely_agent_at_rest(name):
     x = jax.vmap(Unicycle().rest)(jnp.arange(10.0).reshape(5, 2) * 3, jnp.zeros(5))
-    lonely = State(x=x, goal=jnp.ones((5, 2)), t=jnp.asarray(0))
+    lonely = State(x=x, scenario=Goals(jnp.ones((5, 2))), t=jnp.asarray(0))
     action = act(CONTROLLERS[name](DISK), lonely)
     assert np.isfinite(action).all()
     assert (action[1:, 0] == 0).all() and action[0, 0] != 0
@@ -124,7 +124,12 @@ def test_the_tree_leads_to_the_nearest_leader():
     assert parents(Rendezvous(agents=5, graph="path", leaders=(0, 4)))[1:4].tolist() == [0, 1, 4]
     line = jnp.array([[0.0, 0], [0.8, 0], [1.6, 0], [2.4, 0], [9.0, 0]])
     x = jax.vmap(Unicycle().rest)(line, jnp.zeros(5))
-    assert parents(DISK, State(x=x, goal=line, t=jnp.asarray(0)))[1:].tolist() == [0, 1, 2, -1]
+    assert parents(DISK, State(x=x, scenario=Goals(line), t=jnp.asarray(0)))[1:].tolist() == [
+        0,
+        1,
+        2,
+        -1,
+    ]
 
 
 def test_tree_pursuit_solves_the_standard_task():
@@ -152,8 +157,8 @@ def test_point_offset_brings_the_offset_points_to_the_goal():
     )
     z = game.positions(eqx.tree_at(lambda s: s.x, start, last))
     heading = jax.vmap(game.dynamics.heading)(last)
-    np.testing.assert_allclose(z + controller.offset * heading, start.goal, atol=1e-3)
-    distance = np.linalg.norm(z - start.goal, axis=1)
+    np.testing.assert_allclose(z + controller.offset * heading, start.scenario.goal, atol=1e-3)
+    distance = np.linalg.norm(z - start.scenario.goal, axis=1)
     np.testing.assert_allclose(distance, controller.offset, atol=1e-3)
 
 
@@ -167,25 +172,25 @@ def test_lin_francis_maggiore_approaches_slowly():
 
 OWN = """
 from marlyap.controllers import AbstractController, TreePursuit
-from marlyap.game import AbstractGame
+from marlyap.planar import AbstractPlanar, Goals
 
 class PD(AbstractController):
-    game: AbstractGame
+    game: AbstractPlanar
     gain: float = 2.0
 
     def __call__(self, state, key):
         x = state.x
-        return (self.gain * (state.goal - x[:, :2]) - 2.0 * x[:, 2:]) / 5.0
+        return (self.gain * (state.scenario.goal - x[:, :2]) - 2.0 * x[:, 2:]) / 5.0
 
 class Unfinished(AbstractController):
-    game: AbstractGame
+    game: AbstractPlanar
 
 class Needy(AbstractController):
-    game: AbstractGame
+    game: AbstractPlanar
     other: float
 
     def __call__(self, state, key):
-        return 0.0 * state.goal
+        return 0.0 * state.scenario.goal
 
 NotOne = 3
 """
@@ -237,7 +242,9 @@ def test_zero_and_uniform_actions(dynamics):
 
 def test_a_plan_is_replayed_by_the_clock():
     actions = jnp.linspace(-1, 1, 12).reshape(3, 2, 2)
-    at = lambda t: act(Replayed(actions), State(x=jnp.zeros((2, 5)), goal=jnp.zeros((2, 2)), t=t))
+    at = lambda t: act(
+        Replayed(actions), State(x=jnp.zeros((2, 5)), scenario=Goals(jnp.zeros((2, 2))), t=t)
+    )
     for t, row in ((0, 0), (2, 2), (9, 2)):
         assert (at(jnp.asarray(t)) == actions[row]).all()
 

@@ -13,7 +13,7 @@ from marlyap.tasks import TASKS, Formation, Rendezvous
 
 def by_hand(game, state, i):
     """Row i of the observation from the names of its entries alone, in NumPy and float64."""
-    x, goal = np.asarray(state.x, float), np.asarray(state.goal, float)
+    x, goal = np.asarray(state.x, float), np.asarray(state.scenario.goal, float)
     d, linked = game.dynamics, game.adjacency
     psi = x[:, 2] if "psi" in d.names else np.zeros(len(x))
     heading = np.stack([np.cos(psi), np.sin(psi)], 1)

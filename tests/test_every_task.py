@@ -66,12 +66,16 @@ def target(game, states, key):
     """The same scenes with every agent at rest at its goal, heading anywhere."""
     angle = jax.random.uniform(key, states.goal.shape[:2], minval=-3.0, maxval=3.0)
     rest = jax.vmap(jax.vmap(game.dynamics.rest))
-    return eqx.tree_at(lambda s: s.x, states, rest(states.goal, angle))
+    return eqx.tree_at(lambda s: s.x, states, rest(states.scenario.goal, angle))
 
 
 def moved(states, x=None, goal=None):
     new = lambda old, want: old if want is None else jnp.asarray(np.asarray(want, np.float32))
-    return eqx.tree_at(lambda s: (s.x, s.goal), states, (new(states.x, x), new(states.goal, goal)))
+    return eqx.tree_at(
+        lambda s: (s.x, s.scenario.goal),
+        states,
+        (new(states.x, x), new(states.scenario.goal, goal)),
+    )
 
 
 def nudged(states, agent, by, coordinate=slice(None), what="x"):
@@ -105,7 +109,7 @@ def test_the_target_set_is_an_equilibrium_without_cost(game):
     for name in ("costs", "errors", "distance", "rewards"):
         assert not np.any(np.asarray(out[name])), name
     np.testing.assert_array_equal(out["next"].x, there.x)
-    np.testing.assert_array_equal(out["next"].goal, there.goal)
+    np.testing.assert_array_equal(out["next"].goal, there.scenario.goal)
 
 
 @every_game
@@ -177,7 +181,7 @@ def carried(game, states, angle, shift):
     if "psi" in names:
         x[..., names.index("psi")] += angle
     x[..., :2] += shift
-    return moved(states, x, np.array(states.goal, np.float64) @ turn.T + shift)
+    return moved(states, x, np.array(states.scenario.goal, np.float64) @ turn.T + shift)
 
 
 @every_game
@@ -236,7 +240,7 @@ def test_the_view_is_what_the_docstring_says(game):
     states, actions = draw(game, jax.random.key(8))
     out = look(game, states, actions)
     for s in range(BATCH):
-        x, goal = np.asarray(states.x[s], float), np.asarray(states.goal[s], float)
+        x, goal = np.asarray(states.x[s], float), np.asarray(states.scenario.goal[s], float)
         linked = game.adjacency
         if game.graph.startswith("disk:"):
             gap = np.linalg.norm(x[:, None, :2] - x[None, :, :2], axis=2)
@@ -267,8 +271,8 @@ def test_episodes_start_at_rest_in_the_box_and_differ(game):
     keys = jax.random.split(jax.random.key(9), 64)
     s, again = resets(game, keys), resets(game, keys)
     np.testing.assert_array_equal(s.x, again.x)
-    np.testing.assert_array_equal(s.goal, again.goal)
-    x, goal = np.asarray(s.x), np.asarray(s.goal)
+    np.testing.assert_array_equal(s.scenario.goal, again.scenario.goal)
+    x, goal = np.asarray(s.x), np.asarray(s.scenario.goal)
     for first in (x[:, 0, 0], x[:, -1, 1], goal[:, 0, 0], goal[:, 0, 1]):
         assert len(np.unique(first)) == 64
     if game.agents > 1:

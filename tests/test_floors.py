@@ -30,9 +30,11 @@ FLOORS = """
     threefry
     graph
     recheck
+    physics
     dynamics
     sensing
     game
+    planar
     tasks
     perturb
     rollout

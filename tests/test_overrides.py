@@ -27,9 +27,9 @@ from marlyap.certify import certify, save
 from marlyap.dynamics import SingleIntegrator
 from marlyap.errors import UserError
 from marlyap.evaluation import evaluate, outcomes
-from marlyap.game import AbstractGame
 from marlyap.lyapunov_function import AbstractLyapunov, CostSum
 from marlyap.perturb import Perturbed
+from marlyap.planar import AbstractPlanar, Goals
 from marlyap.recheck import recheck
 from marlyap.report.episodes import film
 from marlyap.rollout import Decentralised, rollout
@@ -40,7 +40,7 @@ from marlyap.types import State
 
 
 class Own(Rendezvous):
-    """Every method is its own: nothing here is what `AbstractGame` or `Rendezvous` would do."""
+    """Every method is its own: nothing here is what `AbstractPlanar` or `Rendezvous` would do."""
 
     agents: int = 3
     graph: str = "path"
@@ -50,7 +50,12 @@ class Own(Rendezvous):
 
     def reset(self, key):
         start = super().reset(key)
-        return State(x=start.x, goal=0.5 * start.goal, t=start.t, memory=jnp.zeros((3, 2)))
+        return State(
+            x=start.x,
+            scenario=Goals(0.5 * start.scenario.goal),
+            t=start.t,
+            memory=jnp.zeros((3, 2)),
+        )
 
     def linked(self, state):
         return super().linked(state) & (state.t % 2 == 0)
@@ -60,7 +65,7 @@ class Own(Rendezvous):
 
     def step(self, state, action):
         after = super().step(state, action)
-        return State(x=0.95 * after.x, goal=after.goal, t=after.t, memory=action)
+        return State(x=0.95 * after.x, scenario=after.scenario, t=after.t, memory=action)
 
     def distance(self, state):
         return 1.5 * super().distance(state)
@@ -69,7 +74,7 @@ class Own(Rendezvous):
         return -super().errors(state)
 
     def features(self, state):
-        return jnp.concatenate([self.errors(state), state.memory, 2 * state.goal], axis=1)
+        return jnp.concatenate([self.errors(state), state.memory, 2 * state.scenario.goal], axis=1)
 
     def costs(self, state, action):
         return super().costs(state, action) + 0.1 * jnp.sum(action**2, axis=1)
@@ -99,7 +104,7 @@ class ToGoal(eqx.Module):
     gain: float = 1.5
 
     def __call__(self, state, key):
-        return jnp.clip(self.gain * (state.goal - state.x), -1.0, 1.0)
+        return jnp.clip(self.gain * (state.scenario.goal - state.x), -1.0, 1.0)
 
 
 GAME, LAW = Own(), ToGoal()
@@ -140,7 +145,7 @@ def oracle():
 
 
 def test_the_game_replaces_every_method():
-    methods = {n for n, f in vars(AbstractGame).items() if callable(f) and not n.startswith("_")}
+    methods = {n for n, f in vars(AbstractPlanar).items() if callable(f) and not n.startswith("_")}
     final = {"observations", "cost", "crowded", "local_view", "strengthened"}
     final |= {"entries", "local_entries", "observation_entries"}  # words about them
     assert methods - final <= set(vars(Own))

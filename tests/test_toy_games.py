@@ -15,7 +15,7 @@ from marlyap.algorithms import MADDPG, MASAC, CentralisedSAC, DecentralisedSAC
 from marlyap.constraints.lyapunov import Lyapunov
 from marlyap.dynamics import AbstractDynamics, SingleIntegrator
 from marlyap.evaluation import outcomes
-from marlyap.game import AbstractGame
+from marlyap.planar import AbstractPlanar, Goals
 from marlyap.rollout import Decentralised
 from marlyap.trainer import Schedule, Trainer
 from marlyap.types import State
@@ -46,7 +46,7 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 BANDIT, CONSTANT, REACH = range(3)
 
 
-class Toy(AbstractGame):
+class Toy(AbstractPlanar):
     """Two agents, each with a goal of its own, that move as they wish.
 
     BANDIT: one step, reward 1 - |a - 0.4 o|^2. CONSTANT: reward 1 for ever. REACH: minus distance.
@@ -65,10 +65,10 @@ class Toy(AbstractGame):
     def reset(self, key):
         k_x, k_goal = jax.random.split(key)
         draw = lambda k: jax.random.uniform(k, (2, 2), minval=-1.0, maxval=1.0)
-        return State(x=draw(k_x), goal=draw(k_goal), t=jnp.asarray(0))
+        return State(x=draw(k_x), scenario=Goals(draw(k_goal)), t=jnp.asarray(0))
 
     def observe(self, state, links):
-        return state.goal - state.x
+        return state.scenario.goal - state.x
 
     def terminated(self, state):
         return (self.kind == BANDIT) & (state.t >= 1)

@@ -263,7 +263,7 @@ def test_no_evaluation_starts_where_training_did(wide, begun):
     """Neither are the first observations of the memory among those of the evaluation."""
     e = begun.memory.episodes
     state = seen(wide, 0.0, 0).state
-    gap = state.goal[:, 0] - state.x[:, 0, :, :2]  # [episode, agent, 2]
+    gap = state.scenario.goal[:, 0] - state.x[:, 0, :, :2]  # [episode, agent, 2]
     trained = np.linalg.norm(np.asarray(e.features)[:4, 0, :, :2], axis=-1)
     judged = np.linalg.norm(gap, axis=-1)
     assert np.min(np.abs(trained[:, None] - judged[None]).max(-1)) > 1e-3
@@ -276,7 +276,9 @@ def test_no_evaluation_starts_where_training_did(wide, begun):
 def test_outcomes_are_those_of_the_trajectories(wide):
     got = evaluate(wide, push(0.3), 64, seed=1)
     e = seen(wide, 0.3, 1)
-    distance = np.linalg.norm(e.state.x[..., :2] - e.state.goal, axis=-1).max(-1)  # [episode, time]
+    distance = np.linalg.norm(e.state.x[..., :2] - e.state.scenario.goal, axis=-1).max(
+        -1
+    )  # [episode, time]
     np.testing.assert_allclose(got.final, distance[:, -1], rtol=1e-5)
     np.testing.assert_array_equal(got.held, (distance[:, -5:] <= wide.radius).all(1))
     spin = np.abs(e.state.x[:, -1, :, 4]).max(1)

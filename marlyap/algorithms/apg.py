@@ -28,7 +28,7 @@ from marlyap.errors import within
 from marlyap.game import AbstractGame
 from marlyap.learn import Learnt, polyak
 from marlyap.nets import Actors, Greedy
-from marlyap.rollout import Decentralised, first_fault, rollout
+from marlyap.rollout import Decentralised, charged, first_fault, rollout
 from marlyap.types import Key, Scalar
 
 
@@ -72,9 +72,9 @@ class APG(AbstractModelBased):
         path = rollout(game, Decentralised(Greedy(pi), game), game.reset(k_start), k_act)
         last = jax.tree.map(lambda x: x[-1], path.state)
         ended = jnp.concatenate([jnp.zeros(1, bool), path.terminated])  # at s_0 ... s_H
-        end = game.costs(last, jnp.zeros_like(path.action[0]))
+        end = charged(game, last, game.hold(last))[0]
         cost = jnp.where(ended[:, None], 0.0, jnp.concatenate([path.cost, end[None]]))
-        sharp = lambda c: jnp.mean(c + self.sharpness * c / (c + game.radius), axis=-1)
+        sharp = lambda c: jnp.mean(c + self.sharpness * c / (c + game.edge), axis=-1)
         weights = jnp.arange(1, game.horizon + 1) ** 2.0
         J = jnp.sum(weights / jnp.sum(weights) * sharp(cost[:-1])) + sharp(cost[-1])
         J = J + self.weight * self.rise(jnp.mean(cost, axis=1), game)
@@ -85,7 +85,7 @@ class APG(AbstractModelBased):
         T = min(self.T, c.shape[0] - 1)
         now, ahead = c[:-T], c[T:]
         delta = jax.nn.relu(ahead - (1 - self.decrease) * now)
-        return jnp.mean(jnp.where(now >= game.radius, delta, 0.0))
+        return jnp.mean(jnp.where(now >= game.edge, delta, 0.0))
 
     def improve(self, learner, game, keys, decay):
         """phi <- phi - rate grad J, clipped to norm `clip`; entries not finite count as 0."""

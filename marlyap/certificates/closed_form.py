@@ -11,7 +11,7 @@ from marlyap.certificates.model import SAMPLES, drawn, require_model, require_st
 from marlyap.controllers.point_offset import PointOffset
 from marlyap.dynamics import Unicycle
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
+from marlyap.planar import AbstractPlanar
 
 
 def claim(offset: float, rate: float, level: float, sampled: float) -> str:
@@ -44,7 +44,7 @@ class ClosedForm(AbstractCertificate):
     confidence: float = 1.0
     evidence: ClassVar[Evidence] = "proved"
 
-    def refuse(self, game, controller: Any, V):
+    def refuse(self, game: Any, controller: Any, V):
         if type(controller) is not PointOffset:
             raise UserError(
                 f"closed-form: {type(controller).__name__} is not the controller PointOffset, the "
@@ -57,7 +57,7 @@ class ClosedForm(AbstractCertificate):
         model = lambda states: successor(game, controller, np.asarray(states.x))
         require_step("closed-form", game, controller, states, model, lambda game, s: s.x)
 
-    def check(self, game, controller: Any, V, seed):
+    def check(self, game: Any, controller: Any, V, seed):
         self.refuse(game, controller, V)
         K, root = stiffness(game, controller)
         modes = [mode(mu, controller) for mu in np.linalg.eigvalsh(K)]
@@ -89,7 +89,7 @@ class ClosedForm(AbstractCertificate):
 
 
 def stiffness(
-    game: AbstractGame, controller: PointOffset
+    game: AbstractPlanar, controller: PointOffset
 ) -> tuple[Float[np.ndarray, "agent agent"], Float[np.ndarray, "agent"]]:
     """D^-1/2 (L + B) D^-1/2, similar to D^-1 (L + B), and the diagonal of D^1/2."""
     if graphs.disk_radius(game.graph) is not None:
@@ -103,7 +103,7 @@ def stiffness(
 
 
 def successor(
-    game: AbstractGame, controller: PointOffset, x: Float[np.ndarray, "sample agent 5"]
+    game: AbstractPlanar, controller: PointOffset, x: Float[np.ndarray, "sample agent 5"]
 ) -> Float[np.ndarray, "sample agent 5"]:
     """One semi-implicit step under the law of this certificate, all goals at the origin."""
     linked, b = np.asarray(game.adjacency, float), np.where(game.leads, controller.leader_gain, 0.0)
@@ -147,7 +147,7 @@ def sampled_radius(mu: float, controller: PointOffset, dt: float) -> float:
 
 
 def sublevel(
-    game: AbstractGame,
+    game: AbstractPlanar,
     controller: PointOffset,
     K: np.ndarray,
     root: np.ndarray,

@@ -21,7 +21,7 @@ from marlyap.certificate import (
     percent,
     until_step,
 )
-from marlyap.game import AbstractGame
+from marlyap.game import AbstractRegulation
 
 
 def claim(bound: float, rho: float, farthest: float, steps: int, dt: float) -> str:
@@ -77,7 +77,7 @@ class Composition(AbstractCertificate):
             figures={"excess": excess},
         )
         farthest = float(np.max(ultimate))
-        within = game.radius if self.within is None else self.within
+        within = game.edge if self.within is None else self.within
         say = lambda bound: claim(bound, rho, farthest, steps, game.dt)
         return of_share(
             self,
@@ -101,14 +101,14 @@ class Composition(AbstractCertificate):
         )
 
     def fit(
-        self, game: AbstractGame, values: np.ndarray
+        self, game: AbstractRegulation, values: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """M, delta and the ultimate bound, for the weight whose ultimate bound is the least."""
         N = game.agents
         best = np.full((N, N), np.inf), np.full(N, np.inf), np.full(N, np.inf)
         if len(values) == 0:
             return best
-        hops = graphs.hops(game.adjacency, game.leaders)
+        hops = graphs.hops(game.adjacency, game.informed)
         upstream = game.adjacency & (hops[None, :] < hops[:, None])
         for linked in (upstream, game.adjacency):
             for weight in self.weights:

@@ -99,7 +99,7 @@ class Contraction(AbstractCertificate):
             )
 
     def floor(self, game) -> float:
-        return game.radius if self.c_min is None else self.c_min
+        return game.edge if self.c_min is None else self.c_min
 
     def judge(self, game, V, trajectory, key):
         c = jnp.mean(trajectory.cost, axis=1)

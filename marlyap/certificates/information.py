@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from marlyap.game import AbstractGame
 from marlyap.rollout import Controller, Decentralised, rollout
-from marlyap.types import Action, Key, State
+from marlyap.types import Action, Key, State, by_agent
 
 
 OWN = "each agent acts on its own observation"
@@ -43,10 +43,10 @@ def information(game: AbstractGame, controller: Controller, key: Key) -> str:
     clock = np.flatnonzero(_clock(game, controller, states))
     if len(clock):
         return f"NOT decentralised: agent {clock[0]}'s action changes with the time"
-    for i, j in _pairs(_goals(controller, states, k_change)):
+    for i, j in _pairs(_goals(game, controller, states, k_change)):
         if i != j:
             return f"NOT decentralised: agent {i}'s action changes with the target of agent {j}"
-        if i not in game.leaders:
+        if not game.leads[i]:
             return (
                 f"NOT decentralised: agent {i}'s action changes with the target that it is not told"
             )
@@ -106,7 +106,7 @@ def _clock(game: AbstractGame, controller: Controller, states: State) -> Bool[Ar
 def _influence(
     states: State,
     key: Key,
-    what: Callable[[State], Float[Array, "agent number"]],
+    what: Callable[[State], Float[Array, "agent number"]],  # its rows are about agents
     affected: Callable[[State, Float[Array, "agent number"], Array], Bool[Array, "agent"]],
 ) -> Bool[Array, "agent agent"]:
     """[i, j]: agent i is `affected` by a change of row j of `what` a state holds, in some state.
@@ -126,14 +126,17 @@ def _influence(
 
 
 @eqx.filter_jit
-def _goals(controller: Controller, states: State, key: Key) -> Bool[Array, "agent agent"]:
-    """[i, j]: agent i's action changes with the goal of agent j, in some state."""
+def _goals(
+    game: AbstractGame, controller: Controller, states: State, key: Key
+) -> Bool[Array, "agent agent"]:
+    """[i, j]: agent i's action changes with row j of the scenario, in some state."""
 
-    def affected(state: State, goal: Array, j: Array) -> Array:
-        other = eqx.tree_at(lambda s: s.goal, state, goal)
+    def affected(state: State, rows: Array, j: Array) -> Array:
+        scenario = by_agent(state.scenario, game.agents)[1](rows)
+        other = State(state.x, scenario, state.t, state.memory)
         return _differ(_act(controller, other), _act(controller, state))
 
-    return _influence(states, key, lambda s: s.goal, affected)
+    return _influence(states, key, lambda s: by_agent(s.scenario, game.agents)[0], affected)
 
 
 @eqx.filter_jit
@@ -143,12 +146,13 @@ def _strangers(
     """[i, j]: agent i's action changes with the state of agent j, to which it is not linked."""
 
     def affected(state: State, x: Array, j: Array) -> Array:
-        other, linked = eqx.tree_at(lambda s: s.x, state, x), game.linked(state)
+        other = State(by_agent(state.x, game.agents)[1](x), state.scenario, state.t, state.memory)
+        linked = game.linked(state)
         alike = jnp.all(game.linked(other) == linked, axis=1)  # a disk may link others now
         stranger = ~linked[:, j] & (jnp.arange(game.agents) != j) & alike
         return _differ(_act(controller, other), _act(controller, state)) & stranger
 
-    return _influence(states, key, lambda s: s.x, affected)
+    return _influence(states, key, lambda s: by_agent(s.x, game.agents)[0], affected)
 
 
 @eqx.filter_jit

@@ -12,8 +12,7 @@ from jaxtyping import Array, Float
 
 from marlyap.certificate import AbstractCertificate, Evidence, Verdict
 from marlyap.certificates.jacobian import jacobian
-from marlyap.game import AbstractGame
-from marlyap.lyapunov_function import at_target
+from marlyap.game import AbstractRegulation
 from marlyap.rollout import Controller
 from marlyap.types import State
 
@@ -48,14 +47,15 @@ def claim_not(count: int, decay: float) -> str:
 class Linearisation(AbstractCertificate):
     """Local exponential stability of "at rest on the goal", by the game's own step f and errors e:
 
-        x* = f(x*, 0),  mu(x*) = 0,  e(x*) = 0,  rho(df(x, mu(x))/dx) <= 1 - margin  at x*,
+        x* = f(x*, u*),  mu(x*) = u*,  e(x*) = 0,  rho(df(x, mu(x))/dx) <= 1 - margin  at x*,
 
-    with x the states of all agents (and what floats the game's memory holds), in float64, at the
-    targets of several episodes. The derivative is compared with difference quotients to both sides:
-    where they disagree nothing is said. The margin is wider than the error of the eigenvalues: a
-    chain of m equal ones is known to 1e-16^(1/m) only, 6e-4 for m = 5. Evidence: observed.
+    with u* the holding action (`game.hold`) and x the states of all agents (and what floats the
+    game's memory holds), in float64, at the targets of several episodes. The derivative is compared
+    with difference quotients to both sides: where they disagree nothing is said. The
+    margin is wider than the error of the eigenvalues: a chain of m equal ones is known to
+    1e-16^(1/m) only, 6e-4 for m = 5. Evidence: observed.
 
-    With A = df/dx and B = df/du of the whole team at (x*, 0) the answer is no, whatever the
+    With A = df/dx and B = df/du of the whole team at (x*, u*) the answer is no, whatever the
     controller, where the errors see an eigenvalue that no feedback moves:
 
         w A = lambda w,  w B = 0,  |lambda| >= 1,  w in the row space of de/dx
@@ -128,7 +128,7 @@ def as_double(tree: Any) -> Any:
 
 
 def look(
-    game: AbstractGame, controller: Controller, asked: Linearisation, seed: int
+    game: AbstractRegulation, controller: Controller, asked: Linearisation, seed: int
 ) -> list[dict[str, Any]]:
     """Derivatives, equilibrium and faults at the targets of some episodes, in float64."""
     found = []
@@ -142,10 +142,10 @@ def look(
         plant_fault = _first(
             (
                 (not errors <= AT_REST, f"the errors do not vanish on the target: {errors:.3g}"),
-                (not drift <= AT_REST, f"the goal is no equilibrium: without an action the agents "
-                 f"move by {drift:.3g} in a step"),
+                (not drift <= AT_REST, f"the goal is no equilibrium: under the holding action the "
+                 f"agents move by {drift:.3g} in a step"),
                 (not plant_clock <= 0, "the game's step depends on the time, which is not covered"),
-                (not other <= 0, "the game changes its goals or counts in its memory, which is "
+                (not other <= 0, "the game changes its scenario or counts in its memory, which is "
                  "not covered"),
                 (not kinked <= SMOOTH, "the game's step has no derivative at the goal"),
             )
@@ -153,7 +153,7 @@ def look(
         fault = _first(
             (
                 (not max(action, moved) <= AT_REST, "the goal is no equilibrium: on it the "
-                 f"controller acts by {action:.3g} of the limits and the agents move by "
+                 f"controller is {action:.3g} off the holding action and the agents move by "
                  f"{moved:.3g} in a step"),
                 (not clock <= 0, "the controller's action depends on the time or on chance, which "
                  "is not covered"),
@@ -172,28 +172,28 @@ def _first(faults: Any) -> str | None:
     return next((said for wrong, said in faults if wrong), None)
 
 
-def _examine(game: AbstractGame, controller: Controller, key: Array) -> tuple[Array, ...]:
+def _examine(game: AbstractRegulation, controller: Controller, key: Array) -> tuple[Array, ...]:
     """A, B, de/dx, the closed loop's Jacobian and nine numbers that should be zero."""
     start = game.reset(key)
-    state, act = at_target(game, start), lambda s: controller(s, jax.random.key(0))
+    state, act = game.at_target(start), lambda s: controller(s, jax.random.key(0))
     x, put = coordinates(state)
-    still = jnp.zeros((game.agents, game.dynamics.du))
+    hold = game.hold(state)
     after = lambda s, a: coordinates(game.step(s, a))[0]
-    plant = lambda x: after(put(x), still)
+    plant = lambda x: after(put(x), hold)
     loop = lambda x: after(put(x), act(put(x)))
     errors = lambda x: game.errors(put(x)).ravel()
     A, E, J = jacobian(plant, x), jacobian(errors, x), jacobian(loop, x)
-    B = jacobian(lambda a: after(state, a.reshape(still.shape)), still.ravel())
-    step = game.step(state, still)
+    B = jacobian(lambda a: after(state, a.reshape(hold.shape)), hold.ravel())
+    step = game.step(state, hold)
     fixed = lambda s: eqx.tree_at(lambda s: (s.x, s.t), s, (state.x, state.t))
     largest = lambda *arrays: jnp.max(jnp.stack([jnp.max(jnp.abs(a), initial=0.0) for a in arrays]))
     gaps = (
-        largest(act(state)),
+        largest(act(state) - hold),
         largest(loop(x) - x),
         largest(plant(x) - x),
         largest(errors(x)),
         jnp.maximum(*(_later(s, act) for s in (state, start))),
-        jnp.maximum(*(_later(s, lambda s: after(s, 0.3 + still)) for s in (state, start))),
+        jnp.maximum(*(_later(s, lambda s: after(s, 0.3 + hold)) for s in (state, start))),
         _others(fixed(step), fixed(state)),
         _kink(loop, x, J),
         _kink(plant, x, A),
@@ -209,7 +209,7 @@ def coordinates(state: State) -> tuple[Float[Array, "n"], Callable[[Float[Array,
 
     def put(flat: Float[Array, "n"]) -> State:
         x, memory = back(flat)
-        return State(x=x, goal=state.goal, t=state.t, memory=eqx.combine(memory, rest))
+        return State(x, state.scenario, state.t, eqx.combine(memory, rest))
 
     return flat, put
 
@@ -222,11 +222,12 @@ def _later(state: State, of: Callable[[State], Array]) -> Array:
 
 
 def _others(a: State, b: State) -> Array:
-    """How many of a state's goals and whole numbers differ."""
+    """How many numbers of the scenario, and whole numbers of the memory, differ."""
     raw = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
-    whole = lambda s: [s.goal, *jax.tree.leaves(eqx.filter(s.memory, eqx.is_inexact_array, True))]
+    counts = lambda s: eqx.filter(s.memory, eqx.is_inexact_array, inverse=True)
+    whole = lambda s: jax.tree.leaves((s.scenario, counts(s)))
     pairs = zip(map(raw, whole(a)), map(raw, whole(b)), strict=True)
-    return jnp.sum(jnp.stack([jnp.sum(x != y) for x, y in pairs]))
+    return sum((jnp.sum(x != y) for x, y in pairs), start=jnp.asarray(0))
 
 
 def _kink(f: Callable[[Array], Array], x: Array, J: Array, h: float = 1e-7) -> Array:

@@ -10,8 +10,9 @@ import numpy as np
 from marlyap.certificates.linearisation import as_double
 from marlyap.dynamics import AbstractDynamics
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
+from marlyap.game import AbstractRegulation
 from marlyap.identity import plain
+from marlyap.planar import AbstractPlanar, Goals
 from marlyap.rollout import Controller
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State
@@ -19,20 +20,23 @@ from marlyap.types import State
 
 # What the formulas take for granted of Rendezvous: one that replaces any of it is another game.
 PARTS = ("step", "observe", "observations", "local_view", "linked", "adjacency", "slots", "leads")
-PARTS += ("errors", "distance", "positions", "success", "terminated")
+PARTS += ("errors", "distance", "positions", "goals", "edge", "success", "terminated", "failed")
 SAMPLES = 256
 ROUNDING = 1e-9  # in float64, of states of the size of metres
 
 
 def require_model(
-    name: str, game: AbstractGame, controller: Any, kinds: tuple[type[AbstractDynamics], ...]
+    name: str, game: AbstractRegulation, controller: Any, kinds: tuple[type[AbstractDynamics], ...]
 ) -> None:
     """Raise UserError unless the game is Rendezvous as it stands, and the controller's game too."""
-    other = [part for part in PARTS if getattr(type(game), part) is not getattr(Rendezvous, part)]
-    if other:
+    other = [
+        part for part in PARTS if getattr(type(game), part, None) is not getattr(Rendezvous, part)
+    ]
+    part = other[0] if other else "kind"
+    if other or not isinstance(game, AbstractPlanar):
         raise UserError(
             f"{name}: its formulas are about Rendezvous, and {type(game).__name__} has another "
-            f"`{other[0]}`; take a certificate that plays the game, such as reach."
+            f"`{part}`; take a certificate that plays the game, such as reach."
         )
     if type(game.dynamics) not in kinds or game.dynamics.integrator != "euler":
         known = " or ".join(kind.__name__ for kind in kinds)
@@ -46,11 +50,11 @@ def require_model(
 
 def require_step(
     name: str,
-    game: AbstractGame,
+    game: AbstractRegulation,
     controller: Controller,
     states: State,
     model: Callable[[State], np.ndarray],
-    of: Callable[[AbstractGame, State], Any],
+    of: Callable[[AbstractRegulation, State], Any],
 ) -> None:
     """Raise UserError unless the game's own step under the controller is the model's, in float64.
 
@@ -74,10 +78,10 @@ def require_step(
         )
 
 
-def drawn(game: AbstractGame, spread: np.ndarray, goals: np.ndarray, seed: int = 0) -> State:
+def drawn(game: AbstractRegulation, spread: np.ndarray, goals: np.ndarray, seed: int = 0) -> State:
     """States [sample] with x uniform in +- `spread` [dx] of every agent."""
     rng, shape = np.random.default_rng(seed), (SAMPLES, game.agents, len(spread))
     x = rng.uniform(-1.0, 1.0, shape) * spread
     with jax.enable_x64(True):
-        one = lambda x, goal: State(x=x, goal=goal, t=jnp.asarray(0))
+        one = lambda x, goal: State(x=x, scenario=Goals(goal), t=jnp.asarray(0))
         return jax.vmap(one)(jnp.asarray(x), jnp.asarray(goals))

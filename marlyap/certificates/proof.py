@@ -63,7 +63,7 @@ class Proof(AbstractCertificate):
         if not (self.eta >= 0 and 0 <= self.decay < 1 and self.eta + self.decay > 0):
             raise UserError("proof: V must fall; take eta >= 0 and decay in [0, 1), not both 0.")
         loop = Loop(game, controller)
-        lyapunov(V, game.radius)
+        lyapunov(V, game.edge)
         heading = [np.pi] if loop.turns else []
         states = model.drawn(game, np.array([0.0, 0.0, *heading, *half[2:]]), self.goals())
         answer = lambda states: loop(reduced(game, states)).b[:, None]
@@ -77,7 +77,7 @@ class Proof(AbstractCertificate):
 
     def check(self, game, controller, V, seed):
         self.refuse(game, controller, V)
-        loop, V_of = Loop(game, controller), lyapunov(V, game.radius)
+        loop, V_of = Loop(game, controller), lyapunov(V, game.edge)
         self.require_content(V_of)
         todo, looked, settled = self.begin(controller, V)
         found, total = None, float(np.prod(2 * np.array(self.half)))
@@ -210,7 +210,7 @@ class Loop:
                 "Euler steps, can be proved; set agents=1."
             )
         model.require_model("proof", game, controller, (Unicycle, DoubleIntegrator))
-        self.dt, self.scale = game.dt, game.radius
+        self.dt, self.scale = game.dt, game.edge
         self.limits, self.turns = game.dynamics.limits, type(game.dynamics) is Unicycle
         self.layers = weights(pi.net, None if pi.shared else 0)
 

@@ -21,7 +21,7 @@ from marlyap.certificate import (
 )
 from marlyap.certificates.reach import Reach
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
+from marlyap.game import AbstractRegulation
 from marlyap.perturb import Perturbed, edge_to_cut, follower_to_lose, traced
 from marlyap.rollout import Controller
 from marlyap.statistics import bonferroni
@@ -100,7 +100,7 @@ class Robustness(AbstractCertificate):
         )
 
     def perturbed(
-        self, game: AbstractGame
+        self, game: AbstractRegulation
     ) -> tuple[dict[str, tuple[dict[str, Any], Perturbed]], dict[str, str]]:
         """The points of the curve that can be tested, and why the others cannot."""
         games, without = {}, {}
@@ -127,7 +127,7 @@ class Robustness(AbstractCertificate):
         worst = worst_of(game, seed, "certify", found)
         return {"trials": n, "successes": k, "bound": bound, "holds": holds, "worst": worst}
 
-    def perturbations(self, game: AbstractGame) -> dict[str, dict[str, Any]]:
+    def perturbations(self, game: AbstractRegulation) -> dict[str, dict[str, Any]]:
         """Name and fields of `Perturbed`, for each point of the curve."""
         curve: dict[str, dict[str, Any]] = {f"gain {x:g}": {"gain": x} for x in self.gains}
         curve |= {f"action noise {x:g}": {"noise": x} for x in self.noises}
@@ -145,19 +145,19 @@ class Robustness(AbstractCertificate):
 
 def moved(controller: Controller, game: Perturbed) -> Controller:
     """The controller with the perturbed game's eyes, but the nominal limits that it was told."""
-    if not isinstance(getattr(controller, "game", None), AbstractGame):
+    if not isinstance(getattr(controller, "game", None), AbstractRegulation):
         return controller
     eyes = eqx.tree_at(lambda g: g.gain, game, jnp.asarray(1.0))
     return eqx.tree_at(lambda c: c.game, controller, eyes)  # pyright: ignore
 
 
-def gain_is_idle(game: AbstractGame) -> bool:
+def gain_is_idle(game: AbstractRegulation) -> bool:
     """Whether twice the gain changes nothing in how driven agents move."""
     stronger = game.strengthened(jnp.asarray(2.0))
 
     def same(key: Key) -> Bool[Array, ""]:
         k_start, k_act = jax.random.split(key)
-        state, shape = game.reset(k_start), (game.agents, game.dynamics.du)
+        state, shape = game.reset(k_start), (game.agents, game.du)
         action = jax.random.uniform(k_act, shape, minval=0.1, maxval=0.4)
         for _ in range(2):  # inputs may act late
             state = game.step(state, action)

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from marlyap.certificate import (
     AbstractCertificate,
@@ -19,8 +20,8 @@ from marlyap.certificate import (
     percent,
 )
 from marlyap.certificates.jacobian import jacobian
-from marlyap.dynamics import AbstractDynamics, Unicycle
-from marlyap.game import AbstractGame
+from marlyap.dynamics import AbstractDynamics, Independent, Unicycle
+from marlyap.game import AbstractGame, AbstractRegulation
 from marlyap.layout import grad
 from marlyap.lyapunov_function import Norm
 from marlyap.rollout import Controller
@@ -102,14 +103,17 @@ class Theorem1(AbstractCertificate):
             | {"margin_worst": float(np.min(-excess[asked])) if asked.any() else None},
         )
 
-    def constants(self, game: AbstractGame, V: Any, seen: dict[str, np.ndarray]) -> dict[str, Any]:
+    def constants(
+        self, game: AbstractRegulation, V: Any, seen: dict[str, np.ndarray]
+    ) -> dict[str, Any]:
         """l_f, and l_L by each means there is, over the calibration's region."""
         speed, reach = float(np.nanmax(seen["speed"])), float(np.nanmax(seen["reach"]))
         out = {"speed": speed, "reach": reach}
-        if own_step(game):  # the dynamics are not what moves the agents
+        plant = game.plant
+        if own_step(game) or not isinstance(plant, Independent):
             out["l_f"] = float(np.nanmax(seen["input_gain"]))
         else:
-            out["l_f"] = l_f(game.dynamics, game.dt, speed)
+            out["l_f"] = l_f(plant.dynamics, game.dt, speed)
         out["empirical"] = float(np.nanmax(seen["gradient"]))
         if isinstance(V, Norm):
             out["spectral"] = float(V.net.lipschitz()) * float(np.sqrt(1 + reach**2))
@@ -130,21 +134,22 @@ class _Tuple(eqx.Module):
         new = self.new(state, jax.random.key(0))
         noisy = new + self.noise * jax.random.normal(k_noise, new.shape)
         old = jnp.clip(noisy if self.old is None else self.old(state, jax.random.key(0)), -1.0, 1.0)
-        scale = jnp.asarray(game.dynamics.limits)[None]
+        scale = jnp.asarray(game.plant.limits)[None]
         gradient = grad(lambda x: V.value(game, eqx.tree_at(lambda s: s.x, state, x)))(state.x)
-        velocity = jax.vmap(game.dynamics.velocity)(state.x)
-        speed = jnp.max(jnp.linalg.norm(velocity, axis=1)) + game.dt * jnp.max(scale)
+        scene = game.scene(state)
+        fastest = 0.0 if scene is None else jnp.max(jnp.linalg.norm(scene.velocity, axis=1))
+        speed = fastest + game.dt * jnp.max(scale)
         figures = {
             "V": V.value(game, state),
             "next_V": V.value(game, game.step(state, old)),
             "moved": jnp.linalg.norm((jnp.clip(new, -1.0, 1.0) - old) * scale),
-            "gradient": jnp.linalg.norm(gradient),
+            "gradient": jnp.linalg.norm(ravel_pytree(gradient)[0]),
             "speed": speed,
             "reach": jnp.max(game.distance(state)),
             "outside": (~game.success(state)).astype(float),
         }
         if own_step(game):
-            after = lambda u: game.step(state, u.reshape(new.shape) / scale).x.ravel()
+            after = lambda u: ravel_pytree(game.step(state, u.reshape(new.shape) / scale).x)[0]
             gain = jacobian(after, (jnp.clip(new, -1.0, 1.0) * scale).ravel())
             figures["input_gain"] = jnp.linalg.norm(gain, ord=2)
         return Judgement(jnp.asarray(True), jnp.zeros(()), figures)
@@ -166,12 +171,12 @@ def l_f(dynamics: AbstractDynamics, dt: float, speed: float) -> float:
     return float(np.linalg.norm(input_jacobian(dynamics, x, dt), 2))
 
 
-def own_step(game: AbstractGame) -> bool:
-    """Whether the game moves its agents otherwise than by its dynamics."""
-    return type(game).step is not AbstractGame.step
+def own_step(game: AbstractRegulation) -> bool:
+    """Whether the game moves its agents otherwise than each by the same dynamics."""
+    return type(game).step is not AbstractGame.step or not isinstance(game.plant, Independent)
 
 
 def input_jacobian(dynamics: AbstractDynamics, x: Any, dt: float) -> np.ndarray:
     """ds'/du in physical units, by automatic differentiation."""
-    step = lambda u: dynamics.step(x, u / jnp.asarray(dynamics.limits), dt)
+    step = lambda u: dynamics.step(x, u, dt)
     return np.asarray(jacobian(step, jnp.zeros(dynamics.du)), float)

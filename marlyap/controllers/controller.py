@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from marlyap.dynamics import AbstractDynamics
 from marlyap.errors import UserError
 from marlyap.game import AbstractGame
+from marlyap.planar import AbstractPlanar
 from marlyap.types import Action, Key, State
 
 
@@ -21,18 +21,19 @@ class AbstractController(eqx.Module):
     on its goal. Nothing enforces this: a law that reads more is centralised. A controller keeps no
     memory, and is a pytree, so that jit compiles it once.
 
-    Raises UserError for a game whose dynamics are none of `drives`.
+    Raises UserError for a game whose dynamics, or plant, are none of `drives`.
     """
 
     game: eqx.AbstractVar[AbstractGame]
-    drives: ClassVar[tuple[type[AbstractDynamics], ...]] = ()  # exactly these; empty: any
+    drives: ClassVar[tuple[type, ...]] = ()  # dynamics or plants, exactly these; empty: any
 
     def __check_init__(self):
-        if self.drives and type(self.game.dynamics) not in self.drives:
+        moves = self.game.plant.moves
+        if self.drives and moves not in self.drives:
             known = " or ".join(cls.__name__ for cls in self.drives)
             raise UserError(
-                f"controller: {type(self).__name__} drives {known} only, not "
-                f"{type(self.game.dynamics).__name__}; choose other dynamics for the task."
+                f"controller: {type(self).__name__} drives {known} only, not {moves.__name__}; "
+                "choose another controller or task, or other dynamics for the task."
             )
 
     @abc.abstractmethod
@@ -43,7 +44,7 @@ class AbstractController(eqx.Module):
         """
 
 
-def headings(game: AbstractGame, state: State) -> Float[Array, "agent 2"]:
+def headings(game: AbstractPlanar, state: State) -> Float[Array, "agent 2"]:
     """h_i, the unit vector along each agent's forward axis."""
     return jax.vmap(game.dynamics.heading)(state.x)
 
@@ -54,7 +55,7 @@ def left(h: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
 
 
 def mean_pull(
-    game: AbstractGame, state: State, q: Float[Array, "agent 2"], leader_gain: float
+    game: AbstractPlanar, state: State, q: Float[Array, "agent 2"], leader_gain: float
 ) -> Float[Array, "agent 2"]:
     """e_i = (sum_j (q_j - q_i) + b_i (p*_i - q_i)) / (sum_j 1 + b_i), j over the neighbours (m).
 
@@ -64,10 +65,10 @@ def mean_pull(
     b = jnp.where(jnp.asarray(game.leads), leader_gain, 0.0)
     gaps = jnp.where(linked[:, :, None], q[None, :] - q[:, None], 0.0)
     weight = jnp.sum(linked, axis=1) + b
-    pull = jnp.sum(gaps, axis=1) + b[:, None] * (state.goal - q)
+    pull = jnp.sum(gaps, axis=1) + b[:, None] * (game.goals(state) - q)
     return pull / jnp.where(weight > 0, weight, 1.0)[:, None]
 
 
-def as_action(game: AbstractGame, u: Float[Array, "agent du"]) -> Action:
+def as_action(game: AbstractPlanar, u: Float[Array, "agent du"]) -> Action:
     """Physical inputs (m/s^2, rad/s^2) as an action: divided by their limits and clipped."""
     return jnp.clip(u / jnp.asarray(game.dynamics.limits)[None], -1.0, 1.0)

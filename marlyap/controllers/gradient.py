@@ -5,7 +5,7 @@ import jax
 from marlyap.controllers.cascade import Cascade
 from marlyap.controllers.controller import AbstractController, as_action, mean_pull
 from marlyap.dynamics import Unicycle
-from marlyap.game import AbstractGame
+from marlyap.planar import AbstractPlanar
 
 
 class GradientConsensus(AbstractController):
@@ -16,7 +16,7 @@ class GradientConsensus(AbstractController):
 
     drives = (Unicycle,)
 
-    game: AbstractGame
+    game: AbstractPlanar
     leader_gain: float = 20.0  # b, weight of the goal against one neighbour
     cascade: Cascade = Cascade(near=0.11, near_angle=0.09, k_r=10.0, braking=0.43, alignment=1.25)
 

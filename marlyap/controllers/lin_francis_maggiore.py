@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from marlyap.controllers.controller import AbstractController, as_action, headings, mean_pull
 from marlyap.dynamics import Unicycle
-from marlyap.game import AbstractGame
+from marlyap.planar import AbstractPlanar
 
 
 class LinFrancisMaggiore(AbstractController):
@@ -18,7 +18,7 @@ class LinFrancisMaggiore(AbstractController):
 
     drives = (Unicycle,)
 
-    game: AbstractGame
+    game: AbstractPlanar
     gain: float = 1.0  # k (1/s)
     leader_gain: float = 1.0  # b, weight of the goal against one neighbour
     amplitude: float = 1.0  # of the turn rate (rad/s)

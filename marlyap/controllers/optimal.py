@@ -10,6 +10,7 @@ made first and then replayed:
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -17,7 +18,7 @@ from jaxtyping import Array, Float
 from marlyap.controllers.controller import AbstractController
 from marlyap.dynamics import Unicycle
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
+from marlyap.planar import AbstractPlanar
 from marlyap.rollout import AbstractPlanner
 from marlyap.types import Action, Key, State
 
@@ -41,7 +42,7 @@ class OptimalControl(AbstractPlanner, AbstractController):
 
     drives = (Unicycle,)
 
-    game: AbstractGame
+    game: AbstractPlanar
     miss: float = 1e2  # weight of the final distance (1/m^2)
     effort: float = 1e-4  # weight of the inputs (s^4/m^2 and s^4/rad^2)
 
@@ -58,7 +59,10 @@ class OptimalControl(AbstractPlanner, AbstractController):
         with the better of ipopt's last iterates.
         """
         solve = _solver(self)
-        starts, goals = np.asarray(states.x, float), np.asarray(states.goal, float)
+        starts, goals = (
+            np.asarray(states.x, float),
+            np.asarray(jax.vmap(self.game.goals)(states), float),
+        )
         each = [
             [solve(x, goal) for x, goal in zip(team, targets, strict=True)]
             for team, targets in zip(starts, goals, strict=True)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from marlyap.controllers.controller import AbstractController, as_action, headings, left, mean_pull
 from marlyap.dynamics import Unicycle
-from marlyap.game import AbstractGame
+from marlyap.planar import AbstractPlanar
 
 
 class PointOffset(AbstractController):
@@ -18,7 +18,7 @@ class PointOffset(AbstractController):
 
     drives = (Unicycle,)
 
-    game: AbstractGame
+    game: AbstractPlanar
     offset: float = 0.015  # d (m), smaller than the radius of success
     leader_gain: float = 17.0  # b, weight of the goal against one neighbour
     k_p: float = 24.0  # 1/s^2

@@ -8,7 +8,7 @@ from marlyap import graph as graphs
 from marlyap.controllers.cascade import Cascade
 from marlyap.controllers.controller import AbstractController, as_action, headings
 from marlyap.dynamics import LateUnicycle, Unicycle
-from marlyap.game import AbstractGame
+from marlyap.planar import AbstractPlanar
 from marlyap.types import State
 
 
@@ -25,7 +25,7 @@ class TreePursuit(AbstractController):
 
     drives = (Unicycle, LateUnicycle)
 
-    game: AbstractGame
+    game: AbstractPlanar
     margin: float = 1.9  # predicted stopping distance over the shortest possible
     cascade: Cascade = Cascade()
 
@@ -37,7 +37,7 @@ class TreePursuit(AbstractController):
         x = jax.vmap(lambda x: dynamics.predict(x, self.game.dt))(state.x)
         p = jax.vmap(dynamics.position)(x)
         follow = jnp.where((parent >= 0)[:, None], ends[parent], p)
-        e = jnp.where(leads[:, None], state.goal, follow) - p
+        e = jnp.where(leads[:, None], self.game.goals(state), follow) - p
         u = jax.vmap(self.cascade, in_axes=(None, 0, 0))(self.game, x, e)
         return as_action(self.game, u)
 
@@ -45,7 +45,7 @@ class TreePursuit(AbstractController):
         """The parent of each agent, -1 where there is no path to a leader."""
         linked, n = self.game.linked(state), self.game.agents
         if graphs.disk_radius(self.game.graph) is None:
-            hops = jnp.asarray(graphs.hops(self.game.adjacency, self.game.leaders))
+            hops = jnp.asarray(graphs.hops(self.game.adjacency, self.game.informed))
         else:
             start = jnp.where(jnp.asarray(self.game.leads), 0, n)
             relax = lambda _, h: jnp.minimum(h, 1 + jnp.min(jnp.where(linked, h[None], n), axis=1))

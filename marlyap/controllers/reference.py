@@ -13,7 +13,7 @@ class Zero(AbstractController):
     game: AbstractGame
 
     def __call__(self, state, key):
-        return jnp.zeros((self.game.agents, self.game.dynamics.du))
+        return jnp.zeros((self.game.agents, self.game.du))
 
 
 class UniformlyRandom(AbstractController):
@@ -22,5 +22,5 @@ class UniformlyRandom(AbstractController):
     game: AbstractGame
 
     def __call__(self, state, key):
-        size = (self.game.agents, self.game.dynamics.du)
+        size = (self.game.agents, self.game.du)
         return jax.random.uniform(key, size, minval=-1.0)

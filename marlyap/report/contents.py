@@ -9,7 +9,7 @@ from marlyap import groups, store
 from marlyap.certificate import percent
 from marlyap.errors import UserError
 from marlyap.evaluation import evaluate
-from marlyap.game import AbstractGame
+from marlyap.game import AbstractGame, regulated
 from marlyap.identity import plain, policy_hash
 from marlyap.lyapunov_function import CostSum
 from marlyap.report.changes import changed_fields, command_of, common
@@ -28,7 +28,7 @@ from marlyap.report.data import (
     Within,
 )
 from marlyap.report.episodes import films, worst_case
-from marlyap.report.slices import extremes, slice_of
+from marlyap.report.slices import slices
 from marlyap.run import Run
 
 
@@ -36,7 +36,6 @@ MEASURED = (
     "Measured, not proved: the interval is about {what} in this simulation, from starts drawn as "
     "in training. {more}"
 )
-UNIT = "m"  # of distance and radius
 MOST_FILMED = 4  # configurations, the first run of each
 MOST_COMPARED = 12
 
@@ -106,11 +105,12 @@ def gather(
     )
 
 
-def figures(summary: Mapping[str, Any], unit: str) -> dict[str, Any]:
+def figures(summary: Mapping[str, Any]) -> dict[str, Any]:
     """The fields of `data.Figures` out of the summary of an evaluation or a group."""
-    shares = {name: Share(**_about_share(summary[name])) for name in groups.SHARES}
+    known = [name for name in groups.SHARES if name in summary]
+    shares = {name: Share(**_about_share(summary[name])) for name in known}
     within = [Within(radius=r["radius"], **_about_share(r)) for r in summary["radii"]]
-    return {**summary, **shares, "radii": tuple(within), "unit": unit}
+    return {**summary, **shares, "radii": tuple(within)}
 
 
 def _about_share(part: Mapping[str, Any]) -> dict[str, Any]:
@@ -121,7 +121,7 @@ def _group(label: str, members: Sequence[groups.Measured], certified: bool) -> G
     """What is said of runs that belong together."""
     said = groups.summary(members)
     text = _caveat(said["about"], certified)
-    return Group(label=label, text=text, **figures(said, UNIT))
+    return Group(label=label, text=text, **figures(said))
 
 
 def _trained(run: Run, measured: groups.Measured, label: str, group: str) -> Trained:
@@ -131,7 +131,7 @@ def _trained(run: Run, measured: groups.Measured, label: str, group: str) -> Tra
         for line in history(run)[0]
         if "steps" in line
     )
-    said = figures(measured.evaluation.summary(), UNIT)
+    said = figures(measured.evaluation.summary())
     return Trained(name=measured.name, label=label, group=group, seed=run.seed, log=log, **said)
 
 
@@ -144,8 +144,9 @@ def _title(runs: Sequence[Run], found: Sequence[groups.Measured]) -> str:
 
 def _subtitle(found: Sequence[groups.Measured], teams: Sequence[Group]) -> str:
     count = lambda n, what: f"{n} {what}{'s' * (n != 1)}"
-    sizes = {(m.game.agents, len(m.game.leaders)) for m in found}
-    parts = [f"{count(a, 'agent')}, {count(b, 'leader')}" for a, b in sizes] * (len(sizes) == 1)
+    sizes = {(m.game.agents, len(m.game.informed)) for m in found}
+    leaders = lambda n, told: f", {count(told, 'leader')}" if told < n else ""
+    parts = [count(n, "agent") + leaders(n, told) for n, told in sizes] * (len(sizes) == 1)
     parts.append(count(len(found), "run"))
     parts += [count(len(teams), "configuration")] * (len(teams) > 1)
     return "; ".join(parts)
@@ -241,7 +242,7 @@ def certificates(run: Run, game: AbstractGame, label: str) -> Certified:
         other = other or "game"
         note = f"{run.directory}: its certificate is left out, because it is of another {other}."
         return Certified(notes=(note,))
-    V = None
+    V, there = None, regulated(game)
     if meta["V"]["kind"] == "CostSum":
         V = CostSum(controller=controller, T=meta["V"]["T"], ball=meta["V"]["ball"])
     worst: dict[tuple[str, int], list[str]] = {}
@@ -250,12 +251,11 @@ def certificates(run: Run, game: AbstractGame, label: str) -> Certified:
         if {"purpose", "episode"} <= {*case} and "change" not in case:
             worst.setdefault((case["purpose"], case["episode"]), []).append(name)
     level = meta["verdicts"].get("basin", {}).get("figures", {}).get("level")
-    agents = [] if V is None else extremes(game)
     return Certified(
         claims=tuple(_claim(name, v, label) for name, v in meta["verdicts"].items()),
         films=tuple(
             worst_case(
-                game,
+                there,
                 controller,
                 V,
                 meta["seed"],
@@ -265,9 +265,7 @@ def certificates(run: Run, game: AbstractGame, label: str) -> Certified:
             )
             for case, names in worst.items()
         ),
-        slices=tuple(
-            slice_of(game, V, agent, level, run=label) for agent in agents if V is not None
-        ),
+        slices=() if V is None else slices(there, V, level, label),
     )
 
 

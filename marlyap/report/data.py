@@ -47,7 +47,8 @@ class Figures(Share):
     radius: Number = None  # of success
     radii: tuple[Within, ...] = ()
     held: Share | None = None
-    at_rest: Share | None = None
+    failed: Share | None = None
+    at_rest: Share | None = None  # of a game with a map, as are speed and spin
     stayed: Share | None = None
     beyond_steps: int | None = None  # steps after the last over which `stayed` looks
     violations: Share | None = None
@@ -104,7 +105,7 @@ class Frames:
     leaders: tuple[bool, ...] = ()  # of each agent
     links: tuple[Pairs, ...] = ()  # one entry where they never change, else [time]
     edge: Number = None  # how near is near enough, drawn around each goal
-    unit: str = ""  # of positions, distance and edge
+    unit: str = ""  # of positions and edge
 
     def __post_init__(self):
         put = lambda name, value: object.__setattr__(self, name, value)
@@ -149,7 +150,9 @@ class Film:
     label: str = "episode"  # "best", "median", "worst", ...
     start: str = ""  # number of the start among those evaluated
     run: str = ""
-    distance: np.ndarray | None = None  # [time], of the agent farthest from its goal
+    distance: np.ndarray | None = None  # [time], of the agent farthest from where it has to be
+    edge: Number = None  # the distance up to which an agent counts as arrived
+    unit: str = ""  # of distance and edge
     level: np.ndarray | None = None  # [time]: a Lyapunov function, or the cost
     level_name: str = ""
     rises: bool = False  # whether the level should fall, so that its rises are marked

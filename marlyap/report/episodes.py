@@ -10,13 +10,16 @@ from marlyap import groups
 from marlyap.certificate import start_of
 from marlyap.errors import UserError
 from marlyap.evaluation import episode
-from marlyap.game import AbstractGame
+from marlyap.game import AbstractGame, AbstractRegulation
 from marlyap.lyapunov_function import CostSum
 from marlyap.report.data import Film, Frames
 from marlyap.rollout import Controller, rollout, until
 from marlyap.run import Run
 from marlyap.seeds import Purpose, stream
 from marlyap.types import Key, State, Trajectory
+
+
+METRES = "m"  # the unit of every scene
 
 
 def films(run: Run, measured: groups.Measured, label: str = "") -> list[Film]:
@@ -57,7 +60,7 @@ def one(
 
 
 def worst_case(
-    game: AbstractGame,
+    game: AbstractRegulation,
     controller: Controller,
     V: CostSum | None,
     seed: int,
@@ -82,33 +85,49 @@ def film(
 
     `said` are further fields of the film: label, start, run.
     """
-    dynamics, state = game.dynamics, jax.tree.map(lambda leaf: leaf[:-1], path.state)
-    headings = None
-    if "psi" in dynamics.names:
-        angle = np.asarray(state.x[:, :, 2])
-        headings = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    state = jax.tree.map(lambda leaf: leaf[:-1], path.state)
+    scene = jax.vmap(game.scene)(state)
+    place = (lambda name: None) if scene is None else (lambda name: _array(getattr(scene, name)))
+    positions, frame, goals = place("position"), place("frame"), place("goal")
+    flat = positions is not None and positions.shape[2] > 1  # a road is read by its signals too
     linked = np.triu(np.asarray(jax.vmap(game.linked)(state)))
     links = tuple(tuple((int(i), int(j)) for i, j in np.argwhere(now)) for now in linked)
     frames = Frames(
         times=np.arange(len(linked)) * game.dt,
-        positions=np.asarray(jax.vmap(game.positions)(state)),
-        headings=headings,
-        goals=np.asarray(state.goal),
-        leaders=tuple(bool(x) for x in game.leads),
+        positions=positions,
+        headings=None if frame is None or not flat else _headings(frame),
+        goals=goals,
+        signals={}
+        if flat
+        else {k: np.asarray(v) for k, v in jax.vmap(game.signals)(state).items()},
+        leaders=tuple(bool(x) and not game.leads.all() for x in game.leads),
         links=links[:1] if all(now == links[0] for now in links) else links,
-        edge=game.radius,
-        unit="m",
+        edge=game.edge if game.unit == METRES else None,
+        unit=METRES,
     )
     cost = np.asarray(path.cost).mean(axis=1)
     return Film(
         frames=frames,
         distance=np.asarray(jax.vmap(game.distance)(state)).max(axis=1),
+        edge=game.edge,
+        unit=game.unit,
         level=cost if lyapunov is None else np.asarray(lyapunov),
         level_name="cost" if lyapunov is None else function,
         rises=lyapunov is not None,
         success=bool(game.success(jax.tree.map(lambda leaf: leaf[-1], state))),
         **said,
     )
+
+
+def _array(values: Any) -> np.ndarray | None:
+    return None if values is None else np.asarray(values)
+
+
+def _headings(frame: np.ndarray) -> np.ndarray:
+    """The direction ahead of each body, the first of its axes, seen from above."""
+    ahead = frame[..., 0, :2]
+    size = np.linalg.norm(ahead, axis=-1, keepdims=True)
+    return np.divide(ahead, size, out=np.full_like(ahead, np.nan), where=size > 1e-9)
 
 
 @eqx.filter_jit
@@ -126,7 +145,7 @@ def _lyapunov(game: AbstractGame, controller: Controller, L: Any, path: Trajecto
 
 @eqx.filter_jit
 def _replay(
-    game: AbstractGame, controller: Controller, V: CostSum | None, start: State
+    game: AbstractRegulation, controller: Controller, V: CostSum | None, start: State
 ) -> tuple[Trajectory, jax.Array | None]:
     """Two horizons from a start and a step more, and V along the two."""
     beyond = 1 if V is None else max(1, V.beyond)

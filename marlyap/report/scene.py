@@ -102,7 +102,7 @@ class Scene:
         """Where it ended and where it came from, in a few words."""
         film, parts = self.film, []
         if film.distance is not None:
-            parts.append(f"ends {decimal(film.distance[-1], 3, film.frames.unit)} away")
+            parts.append(f"final distance {decimal(film.distance[-1], 3, film.unit)}")
         parts += [f"start {film.start}"] * bool(film.start)
         return " · ".join(parts)
 
@@ -221,9 +221,9 @@ def _strips(film: Film) -> tuple[Strip, ...]:
         name = f"{film.level_name} (Lyapunov)" if film.rises else film.level_name
         made.append(Strip(name, film.level[None], _span(film.level), rises=film.rises))
     if film.distance is not None:
-        name = f"largest distance ({frames.unit})" if frames.unit else "largest distance"
-        most = _span(np.append(film.distance, frames.edge or 0.0))
-        made.append(Strip(name, film.distance[None], most, mark=frames.edge))
+        name = f"largest distance ({film.unit})" if film.unit else "largest distance"
+        most = _span(np.append(film.distance, film.edge or 0.0))
+        made.append(Strip(name, film.distance[None], most, mark=film.edge))
     for name, values in frames.signals.items():
         made.append(Strip(name, values.T, _span(values, zero=False), agents=True))
     return tuple(made[:MOST_STRIPS])

@@ -8,22 +8,31 @@ import jax.numpy as jnp
 import numpy as np
 
 from marlyap import graph as graphs
-from marlyap.game import AbstractGame
-from marlyap.lyapunov_function import CostSum, at_target
+from marlyap.game import AbstractRegulation
+from marlyap.lyapunov_function import CostSum
+from marlyap.planar import AbstractPlanar
 from marlyap.report.data import Slice
 
 
 REACH = 1.5  # half the side of a slice, in the unit of the game's distance
 
 
-def extremes(game: AbstractGame) -> list[int]:
-    """A leader, and the agent that is farthest from all leaders."""
-    hops = graphs.hops(game.adjacency, game.leaders)
-    return sorted({int(np.argmin(hops)), int(np.argmax(hops))})
+def slices(
+    game: AbstractRegulation, V: CostSum, level: float | None, run: str = ""
+) -> tuple[Slice, ...]:
+    """V around a leader, and around the agent that is farthest from all leaders.
+
+    Only robots in the plane have places that V can be drawn over.
+    """
+    if not isinstance(game, AbstractPlanar):
+        return ()
+    hops = graphs.hops(game.adjacency, game.informed)
+    agents = sorted({int(np.argmin(hops)), int(np.argmax(hops))})
+    return tuple(slice_of(game, V, agent, level, run=run) for agent in agents)
 
 
 def slice_of(
-    game: AbstractGame,
+    game: AbstractPlanar,
     V: CostSum,
     agent: int,
     level: float | None,
@@ -38,8 +47,8 @@ def slice_of(
         label=f"agent {agent}, {'a leader' if game.leads[agent] else 'a follower'}",
         values=values,
         reach=REACH,
-        radius=game.radius,
-        unit="m",
+        radius=game.edge,
+        unit=game.unit,
         level=level if known else None,
         facing="psi" in game.dynamics.names,
         run=run,
@@ -47,9 +56,9 @@ def slice_of(
 
 
 @eqx.filter_jit
-def _plane(game: AbstractGame, V: CostSum, agent: Any, grid: Any) -> jax.Array:
+def _plane(game: AbstractPlanar, V: CostSum, agent: Any, grid: Any) -> jax.Array:
     """V [y, x] with one agent at (x, y) from its goal, facing along x."""
-    rest = at_target(game, game.reset(jax.random.key(0)))
+    rest = game.at_target(game.reset(jax.random.key(0)))
     if "psi" in game.dynamics.names:
         rest = eqx.tree_at(lambda s: s.x, rest, rest.x.at[:, 2].set(0.0))
 

@@ -6,12 +6,12 @@ from jaxtyping import Array, Float
 
 from marlyap.dynamics import AbstractDynamics, Unicycle
 from marlyap.errors import UserError, within
-from marlyap.game import AbstractGame
+from marlyap.planar import AbstractPlanar, Goals
 from marlyap.tasks.rendezvous import scatter, with_motion
 from marlyap.types import State
 
 
-class Formation(AbstractGame):
+class Formation(AbstractPlanar):
     """Agent i ends within `radius` of its place; a leader sees its own place.
 
     The formation is turned by a random angle each episode, so followers must read it off the
@@ -41,7 +41,7 @@ class Formation(AbstractGame):
         k_start, k_turn = jax.random.split(key)
         start = scatter(self.dynamics, self.agents, self.size, k_start)
         turn = jax.random.uniform(k_turn, (), minval=-jnp.pi, maxval=jnp.pi)
-        return State(x=start.x, goal=start.goal + self.places(turn), t=start.t)
+        return State(x=start.x, scenario=Goals(start.scenario.goal + self.places(turn)), t=start.t)
 
     def places(self, turn: Float[Array, ""]) -> Float[Array, "agent 2"]:
         """Offsets of the agents' places from the centre (m)."""

@@ -6,11 +6,11 @@ from jaxtyping import Array, Float
 
 from marlyap.dynamics import AbstractDynamics, Unicycle
 from marlyap.errors import UserError, within
-from marlyap.game import AbstractGame
+from marlyap.planar import AbstractPlanar, Goals
 from marlyap.types import Key, State
 
 
-class Rendezvous(AbstractGame):
+class Rendezvous(AbstractPlanar):
     """Agents start at rest anywhere in a square and end within `radius` of one target.
 
     The target is drawn anew each episode, or followers could learn it by heart. The cost of an
@@ -53,11 +53,11 @@ def scatter(dynamics: AbstractDynamics, agents: int, size: float, key: Key) -> S
     angle = jax.random.uniform(k_heading, (agents,), minval=-jnp.pi, maxval=jnp.pi)
     x = jax.vmap(dynamics.rest)(spread(k_position, (agents, 2)), angle)
     goal = jnp.broadcast_to(spread(k_target, (2,)), (agents, 2))
-    return State(x=x, goal=goal, t=jnp.asarray(0))
+    return State(x=x, scenario=Goals(goal), t=jnp.asarray(0))
 
 
 def with_motion(
-    game: AbstractGame, distance: Float[Array, "agent"], state: State, weight: float
+    game: AbstractPlanar, distance: Float[Array, "agent"], state: State, weight: float
 ) -> Float[Array, "agent"]:
     """distance + weight (v^2 + omega^2): without the second term, motion at the goal is free."""
     return distance + weight * game.motion(state) if weight else distance
