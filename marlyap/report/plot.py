@@ -265,6 +265,9 @@ def level_sets(axes: Axes, part: Slice) -> None:
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=marks, yticks=marks)
     values = np.ma.masked_invalid(part.values)
     levels = np.unique(np.quantile(values.compressed(), [0.03, 0.1, 0.25, 0.5, 0.75, 0.95]))
+    levels = levels[levels > values.min()]  # V is 0 in a whole ball: no line, but a jagged one
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(lambda value, _: short(value))
     lines = axes.contour(grid, grid, values, levels, colors=PALETTE[0], linewidths=1, alpha=0.8)
     axes.clabel(lines, fmt=lambda level: f"{level:.3g}", fontsize=7, colors=SOFT)
     if part.level is not None:
