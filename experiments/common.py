@@ -37,7 +37,7 @@ from marlyap.algorithm import AbstractAlgorithm
 from marlyap.certificates.contraction import Contraction
 from marlyap.config import fields
 from marlyap.errors import UserError
-from marlyap.evaluation import RADII, Evaluation, evaluate, share
+from marlyap.evaluation import Evaluation, evaluate, share
 from marlyap.fit import fit
 from marlyap.game import AbstractGame
 from marlyap.identity import policy_hash
@@ -191,7 +191,7 @@ def fill(name: str, cases: Sequence[Case], args: argparse.Namespace) -> None:
         contraction = about | {"T": T, "beta": BETA} | counted(falls >= BETA) | by
         put(args, f"{name}-contraction", columns, [contraction])
         made = after(found) | {"policy": policy_hash(controller)} | provenance()
-        success = [about | {"radius": r} | counted(found.final <= r) | made for r in RADII]
+        success = [about | {"radius": r} | counted(found.final <= r) | made for r in found.radii]
         put(args, f"{name}-success", columns, success)
         if not args.keep:
             shutil.rmtree(run.directory / "checkpoints", ignore_errors=True)

@@ -7,14 +7,13 @@ of other keys. Without --quick it needs casadi.
 import argparse
 import csv
 import io
-import itertools
 from pathlib import Path
 
 from common import after
 
 from marlyap.controllers import CONTROLLERS, Cascade, OptimalControl
 from marlyap.dynamics import Unicycle
-from marlyap.evaluation import RADII, evaluate, share
+from marlyap.evaluation import evaluate, share
 from marlyap.identity import policy_hash
 from marlyap.provenance import provenance
 from marlyap.store import write_text_atomic
@@ -63,7 +62,7 @@ def main():
         if (n, graph, leaders, horizon) == (3, "complete", 1, 40) and not quick:
             planner = OptimalControl(game)
             final["optimal-control"] = evaluate(game, planner, 50, SEED), planner
-        for name, radius in itertools.product(final, RADII):
+        for name, radius in ((n, r) for n, (found, _) in final.items() for r in found.radii):
             found, controller = final[name]
             s = share(found.final <= radius, 0.95)
             counts = (s["episodes"], s["successes"], s["success_rate"])

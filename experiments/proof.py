@@ -26,6 +26,7 @@ from marlyap.certificates.proof import Proof, extents
 from marlyap.certify import certify, save
 from marlyap.lyapunov_function import Approach
 from marlyap.nets import Actors, Greedy, Shape
+from marlyap.planar import Goals
 from marlyap.provenance import provenance
 from marlyap.rollout import Decentralised
 from marlyap.seeds import stream

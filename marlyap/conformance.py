@@ -219,12 +219,16 @@ def nudged(
     values[np.arange(len(values)), agent, coordinate] += by
     put = lambda tree, row: by_agent(tree, game.agents)[1](row)
     new = eqx.combine(jax.vmap(put)(_numbers(part), jnp.asarray(values)), part)
-    return dataclasses.replace(states, **{what: kept(new)})
+    return eqx.tree_at(lambda s: getattr(s, what), states, kept(new), is_leaf=_is_none)
 
 
 def _numbers(tree: Any) -> Any:
     """The floats of a tree as JAX arrays, and None for the rest."""
     return jax.tree.map(jnp.asarray, eqx.filter(tree, _is_float))
+
+
+def _is_none(leaf: Any) -> bool:
+    return leaf is None
 
 
 def _is_float(leaf: Any) -> bool:
@@ -333,10 +337,14 @@ def shapes(game: AbstractGame) -> Faults:
 
 def _wrong_state(game: AbstractGame, state: State) -> Faults:
     """Parts of a start that have another shape or type than the game says."""
-    shapes = eqx.filter_eval_shape(
-        lambda s: {k: v[0] for k, v in game.state_shapes(s).items()}, state
-    )
-    wanted = {name: shape for name, (_, shape) in game.state_shapes(state).items()}
+    wanted = {}
+
+    def arrays(state: State) -> dict[str, Any]:
+        parts = game.state_shapes(state)
+        wanted.update({name: shape for name, (_, shape) in parts.items()})
+        return {name: array for name, (array, _) in parts.items()}
+
+    shapes = eqx.filter_eval_shape(arrays, state)
     for name, found in shapes.items():
         yield from _unlike(
             f"reset: {name}", found, wanted[name], "integer" if name == "t" else "floating"
@@ -686,9 +694,8 @@ def _unflat(states: State) -> Callable[[np.ndarray], State]:
     def back(x: np.ndarray) -> State:
         parts = np.split(x, ends, axis=1)
         new = [p.reshape(leaf.shape) for p, leaf in zip(parts, leaves, strict=True)]
-        return dataclasses.replace(
-            states, x=eqx.combine(jax.tree.unflatten(structure, new), states.x)
-        )
+        x = eqx.combine(jax.tree.unflatten(structure, new), states.x)
+        return eqx.tree_at(lambda s: s.x, states, x)
 
     return back
 

@@ -107,18 +107,16 @@ class Unicycle(AbstractDynamics):
     blocks: ClassVar[tuple[tuple[int, ...], ...]] = ((3, 4), (2,), (0, 1))
 
     def field(self, x, u):
-        _, _, psi, v, omega = x
-        a, r = u
-        return jnp.stack([v * jnp.cos(psi), v * jnp.sin(psi), omega, a, r])
+        return rolling(x, u)
 
     def position(self, x):
         return x[:2]
 
     def heading(self, x):
-        return jnp.stack([jnp.cos(x[2]), jnp.sin(x[2])])
+        return along(x[2])
 
     def velocity(self, x):
-        return x[3] * self.heading(x)
+        return x[3] * along(x[2])
 
     def rates(self, x):
         return x[3:]
@@ -144,22 +142,17 @@ class LateUnicycle(AbstractDynamics):
     felt: ClassVar[tuple[str, ...]] = ("v", "omega", "a", "r")
     blocks: ClassVar[tuple[tuple[int, ...], ...]] = Unicycle.blocks
 
-    @property
-    def prompt(self) -> Unicycle:
-        """The unicycle whose inputs act at once."""
-        return Unicycle(self.limits, self.integrator)
-
     def field(self, x, u):
-        return jnp.concatenate([self.prompt.field(x[:5], x[5:]), jnp.zeros(2)])
+        return jnp.concatenate([rolling(x[:5], x[5:]), jnp.zeros(2)])
 
     def position(self, x):
         return x[:2]
 
     def heading(self, x):
-        return self.prompt.heading(x)
+        return along(x[2])
 
     def velocity(self, x):
-        return self.prompt.velocity(x)
+        return x[3] * along(x[2])
 
     def rates(self, x):
         return x[3:]
@@ -173,6 +166,18 @@ class LateUnicycle(AbstractDynamics):
 
     def predict(self, x, dt):
         return self.step(x, jnp.zeros(2), dt)
+
+
+def rolling(x: Float[Array, "5"], u: Float[Array, "2"]) -> Float[Array, "5"]:
+    """x' of a unicycle."""
+    _, _, psi, v, omega = x
+    a, r = u
+    return jnp.stack([v * jnp.cos(psi), v * jnp.sin(psi), omega, a, r])
+
+
+def along(psi: Float[Array, ""]) -> Float[Array, "2"]:
+    """The unit vector in the direction psi (rad)."""
+    return jnp.stack([jnp.cos(psi), jnp.sin(psi)])
 
 
 class DoubleIntegrator(AbstractDynamics):

@@ -136,6 +136,11 @@ class Evaluation(eqx.Module):
     beyond: int  # steps after the horizon over which `stayed` looks
 
     @property
+    def radii(self) -> tuple[float, ...]:
+        """The edges of the success curve (`unit`): half to three times that of the game."""
+        return tuple(round(self.edge * k, 12) for k in TIMES)
+
+    @property
     def success_rate(self) -> float:
         return float(np.mean(self.successes))
 
@@ -146,8 +151,7 @@ class Evaluation(eqx.Module):
 
     def summary(self, confidence: float = 0.95) -> dict[str, Any]:
         """Plain numbers: rates with exact intervals, distances (m), times (s), speeds."""
-        radii = [round(self.edge * k, 12) for k in TIMES]
-        within = [{"radius": r} | share(self.final <= r, confidence) for r in radii]
+        within = [{"radius": r} | share(self.final <= r, confidence) for r in self.radii]
         found = (
             share(self.successes, confidence)
             | {"confidence": confidence, "radius": self.edge, "unit": self.unit, "radii": within}

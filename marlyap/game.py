@@ -11,7 +11,7 @@ learning rule. Three abstract classes, each a kind of the one before:
 import abc
 import dataclasses
 from functools import lru_cache
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -141,14 +141,14 @@ class AbstractGame(eqx.Module):
         named = enumerate(self.plant.states)
         return {f"{e.name} ({e.unit})": state.x[: self.agents, k] for k, e in named}
 
-    def resized(self, agents: int) -> Self:
+    def resized(self, agents: int) -> "AbstractGame":
         """The same game with another number of agents.
 
         Raises UserError for a number, or a game, that does not allow it.
         """
         return dataclasses.replace(self, agents=agents)  # pyright: ignore
 
-    def strengthened(self, gain: float | Array) -> Self:
+    def strengthened(self, gain: float | Array) -> "AbstractGame":
         """The same game with inputs `gain` times as strong: the plant's limits are scaled."""
         limits = lambda game: game.plant.limits
         return eqx.tree_at(limits, self, tuple(gain * u for u in limits(self)))

@@ -62,7 +62,9 @@ class AbstractPlant(eqx.Module):
         )
 
 
-def check_inputs(limits: tuple[float, ...], inputs: tuple[str, ...], integrator: str) -> None:
+def check_inputs(
+    limits: tuple[float | Array, ...], inputs: tuple[str, ...], integrator: str
+) -> None:
     """Raise UserError unless each input has one positive limit and the integrator is known."""
     traced = not all(isinstance(u, (int, float)) for u in limits)  # scaled inside jit
     if len(limits) != len(inputs) or not (traced or all(0 < u < 1e6 for u in limits)):

@@ -38,7 +38,7 @@ class AbstractPlanar(AbstractRegulation):
             raise UserError(f"radius: {self.radius} m must be a positive distance in metres.")
         if len(set(self.leaders)) != len(self.leaders):
             raise UserError(f"leaders: {self.leaders} names an agent twice.")
-        if not self.leaders or not all(0 <= i < n for i in self.leaders):
+        if not self.leaders or not all(0 <= i < max(n, 1) for i in self.leaders):
             raise UserError(
                 f"leaders: {self.leaders} must name at least one agent, each from 0 to {n - 1}."
             )
@@ -77,6 +77,9 @@ class AbstractPlanar(AbstractRegulation):
     def distance(self, state):
         """How far each agent is from its goal (m)."""
         return jnp.linalg.norm(self.positions(state) - self.goals(state), axis=1)
+
+    def costs(self, state, action):
+        return self.distance(state)
 
     def errors(self, state):
         """Per agent: goal - p_i in its own frame, and its rates."""

@@ -587,7 +587,7 @@ def test_the_linearisation_asks_for_an_equilibrium_that_does_not_move():
 
     moving = Drifting(jnp.eye(2) * 0.5, jnp.asarray(0.0))
     verdict = Linearisation().check(moving, Idle(), CostSum(Idle()), 0)
-    assert not verdict.holds and "without an action the agents move" in verdict.claim
+    assert not verdict.holds and "under the holding action the agents move" in verdict.claim
     kinked = lambda state, key: -3.0 * jnp.abs(state.x - state.scenario.goal)
     verdict = Linearisation().check(POINT, kinked, CostSum(Idle()), 0)
     assert not verdict.holds and "no derivative" in verdict.claim

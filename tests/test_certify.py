@@ -157,4 +157,4 @@ def test_the_task_that_was_asked_is_the_one_certified(run, tmp_path, capsys):
     place = tmp_path / "asked"
     assert said(capsys, "certify", run.directory, *words, "--out", place)[0] == 0
     _, meta = store.read(place, "certificate")
-    assert meta["game"]["radius"] == 0.7 and meta["verdicts"]["reach"]["scope"]["radius"] == 0.7
+    assert meta["game"]["radius"] == 0.7 and meta["verdicts"]["reach"]["scope"]["edge"] == 0.7

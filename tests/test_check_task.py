@@ -279,7 +279,7 @@ class ErrorsOfOneAxis(Sound):
         return (state.x - state.scenario.goal) * jnp.array([[1.0, 0.0]])
 
 
-@breaks("target", "step: without an action agents at rest move by 0.01")
+@breaks("target", "step: from the target set, under the holding action, the errors become")
 class Wind(Sound):
     def step(self, state, action):
         after = super().step(state, action)
@@ -373,6 +373,12 @@ PAYS = r"at step \d stops its costs, so that ending early pays; count such state
 class CollisionEnds(Sound):
     def terminated(self, state):
         return jnp.any(self.crowded(state, 0.4))
+
+
+@breaks("failure", "failure_cost: it is 0, and a step before a failure costs")
+class FailureIsFree(Sound):
+    def failed(self, state):
+        return jnp.any(jnp.abs(self.positions(state)) > 1.05)
 
 
 @breaks("time_limit", "terminated: it depends on the time limit")

@@ -18,6 +18,7 @@ from marlyap.controllers import (
 from marlyap.dynamics import DoubleIntegrator, LateUnicycle, Unicycle
 from marlyap.errors import UserError
 from marlyap.evaluation import evaluate
+from marlyap.planar import Goals
 from marlyap.rollout import rollout
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State
@@ -61,7 +62,7 @@ def distances(game, controller, episodes):
 def test_an_agent_uses_only_what_it_may_know(name):
     state = moving(STRONG)
     others = [eqx.tree_at(lambda s: s.x, state, state.x.at[j].add(0.3)) for j in range(5)]
-    blind = eqx.tree_at(lambda s: s.scenario.goal, state, state.goal.at[1:].add(7.0))
+    blind = eqx.tree_at(lambda s: s.scenario.goal, state, state.scenario.goal.at[1:].add(7.0))
     out = np.asarray(act_all(CONTROLLERS[name](STRONG), batch([state, *others, blind])))
     for j in range(5):
         for i in range(5):

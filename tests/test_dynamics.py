@@ -38,7 +38,7 @@ def float64():
 @eqx.filter_jit
 def drive(dynamics, x, actions, dt, repeat):
     """Hold each action for `repeat` steps of dt."""
-    tick = lambda x, a: (dynamics.step(x, a, dt), None)
+    tick = lambda x, a: (dynamics.step(x, dynamics.inputs_of(a), dt), None)
     return jax.lax.scan(tick, x, jnp.repeat(actions, repeat, axis=0))[0]
 
 
@@ -97,23 +97,28 @@ def test_long_runs_follow_the_reference_in_single_precision(name, integrator):
     assert np.max(np.abs(got - exact)) < (2e-5 if integrator == "rk4" else 0.1)
 
 
+def driven(dynamics, x, action, dt):
+    """The state after a step under an action in [-1, 1]."""
+    return dynamics.step(jnp.asarray(x), dynamics.inputs_of(jnp.asarray(action)), dt)
+
+
 def test_semi_implicit_euler_moves_velocities_first_then_heading_then_position():
     x, y, psi, v, omega = 0.3, -0.2, 0.7, 1.1, -0.4
     dt, a, r = 0.1, 0.5 * 2.0, -0.25 * 3.0
     v1, omega1 = v + dt * a, omega + dt * r
     psi1 = psi + dt * omega1
     want = [x + dt * v1 * np.cos(psi1), y + dt * v1 * np.sin(psi1), psi1, v1, omega1]
-    got = Unicycle((2.0, 3.0)).step(jnp.array([x, y, psi, v, omega]), jnp.array([0.5, -0.25]), dt)
+    got = driven(Unicycle((2.0, 3.0)), [x, y, psi, v, omega], [0.5, -0.25], dt)
     np.testing.assert_allclose(got, want, rtol=1e-14)
 
 
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 def test_integrators_of_integrators_are_exact(integrator):
     x, v, u, dt = np.array([0.3, -1.0]), np.array([0.7, 0.2]), np.array([0.5, -0.25]), 0.1
-    one = SingleIntegrator((2.0, 3.0), integrator).step(jnp.array(x), jnp.array(u), dt)
+    one = driven(SingleIntegrator((2.0, 3.0), integrator), x, u, dt)
     np.testing.assert_allclose(one, x + dt * u * [2, 3], rtol=1e-14)
 
-    two = DoubleIntegrator((2.0, 3.0), integrator).step(jnp.array([*x, *v]), jnp.array(u), dt)
+    two = driven(DoubleIntegrator((2.0, 3.0), integrator), [*x, *v], u, dt)
     a = u * [2, 3]
     v1 = v + dt * a
     x1 = x + dt * v1 if integrator == "euler" else x + dt * v + dt**2 / 2 * a
@@ -133,7 +138,7 @@ def test_a_late_unicycle_does_one_step_later_what_a_unicycle_does(integrator):
     then = drive(late, y, jnp.concatenate([actions, idle]), 0.1, 1)
     np.testing.assert_allclose(then[:5], soon, rtol=1e-14)
     np.testing.assert_array_equal(then[5:], 0)
-    asked = late.step(y, jnp.array(actions[0]), 0.1)[5:]
+    asked = driven(late, y, actions[0], 0.1)[5:]
     np.testing.assert_array_equal(asked, np.clip(actions[0], -1, 1) * limits)
 
 
@@ -142,7 +147,7 @@ def test_actions_are_clipped_and_scaled_by_the_limits(name):
     x, dt = jnp.array(start(name, np.random.default_rng(3))), 0.1
     tight = replace(DYNAMICS[name], limits=(0.5, 2.0))
     unit = replace(DYNAMICS[name], limits=(1.0, 1.0))
-    step = lambda f, a: np.asarray(f.step(x, jnp.array(a), dt))
+    step = lambda f, a: np.asarray(f.step(x, f.inputs_of(jnp.array(a)), dt))
     np.testing.assert_array_equal(step(tight, [5.0, -1.01]), step(tight, [1.0, -1.0]))
     np.testing.assert_allclose(step(tight, [0.6, 0.2]), step(unit, [0.3, 0.4]), rtol=1e-14)
     assert np.any(step(tight, [0.99, -0.99]) != step(tight, [1.0, -1.0]))
@@ -166,7 +171,7 @@ def test_what_an_agent_shows_of_itself(name):
 
 
 def linearisation(f, x, dt=0.1):
-    step = lambda x, a: f.step(x, a, dt)
+    step = lambda x, a: f.step(x, f.inputs_of(a), dt)
     return (np.asarray(j) for j in jax.jacobian(step, (0, 1))(jnp.array(x), jnp.zeros(2)))
 
 
@@ -199,7 +204,9 @@ def test_the_lipschitz_constant_in_the_action():
     dt, limit, f = 0.1, 5.0, Unicycle()
     gain = jax.jit(
         lambda v, psi: jnp.linalg.norm(
-            jax.jacobian(lambda a: f.step(jnp.stack([0.0, 0.0, psi, v, 0.3]), a, dt))(jnp.zeros(2)),
+            jax.jacobian(lambda a: driven(f, jnp.stack([0.0, 0.0, psi, v, 0.3]), a, dt))(
+                jnp.zeros(2)
+            ),
             ord=2,
         )
     )

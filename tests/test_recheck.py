@@ -367,7 +367,7 @@ FORGERIES = {
         (V + "reach/worst/badness", 1e-4), (V + "reach/worst/figures/final_distance", 1e-4)
     ),
     "worst-state": put((V + "reach/worst/state/x/0/0", lambda old: old + 0.1)),
-    "worst-goal": put((V + "reach/worst/state/goal/1/0", lambda old: old + 0.1)),
+    "worst-goal": put((V + "reach/worst/state/scenario/goal/1/0", lambda old: old + 0.1)),
     "worst-episode": put((V + "reach/worst/episode", -1)),
     "worst-seed": put((V + "reach/worst/seed", 2)),
     "worst-purpose": put((V + "reach/worst/purpose", "calibrate")),

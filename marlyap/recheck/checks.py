@@ -27,6 +27,14 @@ POINT = dict(perturbation=TEXT, change=OBJECT, trials=WHOLE, successes=WHOLE, bo
 POINT |= dict(holds=FLAG, worst=OBJECT)
 
 
+def state_of(said: dict[str, Any], what: str) -> dict[str, np.ndarray]:
+    """Positions and goals of a start that the file tells."""
+    record(f"the state of {what}", said, dict(x=LIST, scenario=OBJECT))
+    record(f"the scenario of {what}", said["scenario"], dict(kind=TEXT, goal=LIST))
+    agree(f"the kind of the scenario of {what}", "Goals", said["scenario"]["kind"])
+    return {"x": np.array(said["x"], float), "goal": np.array(said["scenario"]["goal"], float)}
+
+
 class Case(NamedTuple):
     """One verdict of the file, and what it is checked with."""
 
@@ -138,12 +146,12 @@ def worst(case: Case, found: Found, said: Any, change: dict[str, Any] | None = N
     e = said["episode"]
     if not 0 <= e < n or not (found.asked | found.edge)[e]:
         raise Rejected(f"certificate: {what} is rollout {e}, which was not judged.")
-    record(f"the state of {what}", said["state"], dict(x=LIST, goal=LIST))
+    told = state_of(said["state"], what)
     x, goal, _ = sim.starts(fold(sim.keys(e), 0))
     x[..., :2] *= (change or {}).get("spread", 1.0)
     for part, own in (("x", x[0]), ("goal", goal[0])):
-        told = np.array(said["state"][part], float)
-        if told.shape != own.shape or not np.abs(told - own).max() <= 1e-4 * (1 + sim.game["size"]):
+        close = 1e-4 * (1 + sim.game["size"])
+        if told[part].shape != own.shape or not np.abs(told[part] - own).max() <= close:
             raise Rejected(f"certificate: {part} of {what} is not that of rollout {e}.")
     if not found.close[e]:
         agree(f"whether {what} failed", not found.holds[e], said["failed"])

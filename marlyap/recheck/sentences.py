@@ -6,7 +6,7 @@ from typing import Any
 
 
 MEANING = {
-    "CostSum": "the sum of the next {T} costs beyond {ball:g} m",
+    "CostSum": "the sum of the next {T} costs beyond {ball:g} {unit}",
     "Quadratic": "a quadratic form in the errors",
     "Norm": "a trained network that is zero on the target set",
 }
@@ -34,7 +34,7 @@ class Sentences:
 
     def __init__(self, game: dict[str, Any], V: dict[str, Any]):
         self.game, self.H, self.dt = game, game["horizon"], game["dt"]
-        self.V = MEANING.get(V["kind"], "").format(T=V.get("T"), ball=V["ball"])
+        self.V = MEANING.get(V["kind"], "").format(T=V.get("T"), ball=V["ball"], unit=V.get("unit"))
         self.ball = V["ball"]
         self.arrived = f"every agent within {game['radius']:g} m of its goal"
         self.end = f"{self.H * self.dt:g} s"
@@ -48,7 +48,8 @@ class Sentences:
             "horizon_steps": steps,
             "horizon_seconds": steps * self.dt,
             "disturbance": disturbance,
-            "radius": self.game["radius"],
+            "edge": self.game["radius"],
+            "unit": "m",
             "information": self.information,
         }
 
@@ -77,8 +78,8 @@ class Sentences:
 
     def no_equilibrium(self, action: float, moved: float) -> str:
         return (
-            f"the goal is no equilibrium: on it the controller acts by {action:.3g} of the limits "
-            f"and the agents move by {moved:.3g} in a step"
+            f"the goal is no equilibrium: on it the controller is {action:.3g} off the holding "
+            f"action and the agents move by {moved:.3g} in a step"
         )
 
     def no_derivative(self) -> str:

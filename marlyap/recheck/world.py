@@ -34,7 +34,7 @@ DYNAMICS = dict(kind=TEXT, limits=LIST, integrator=TEXT)
 NORM = dict(kind=TEXT, net=OBJECT, errors=WHOLE, slope=NUMBER)
 LAYER = {"kind": "Layer", "weight": None, "bias": None}
 V_KEYS = {
-    "CostSum": dict(kind=TEXT, controller=OBJECT, T=WHOLE, ball=NUMBER),
+    "CostSum": dict(kind=TEXT, controller=OBJECT, T=WHOLE, ball=NUMBER, unit=TEXT),
     "Quadratic": dict(kind=TEXT, P=(type(None),), ball=NUMBER),
     "Norm": dict(kind=TEXT, net=OBJECT, ball=NUMBER),
 }

@@ -1,0 +1,106 @@
+"""Every game steps, costs, fails and succeeds as an independent NumPy oracle said it does.
+
+The files in golden/ hold three trajectories of each game: random actions, a reference controller,
+and actions beyond the limits, which have to clip.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from marlyap.game import AbstractRegulation
+from marlyap.planar import Goals
+from marlyap.tasks import TASKS
+from marlyap.types import State
+
+
+class Case(NamedTuple):
+    """How the file of a game is to be read."""
+
+    task: str
+    parts: Callable[[dict[str, Any]], tuple[Any, Any]]  # x and scenario of a state in the file
+    errors: Callable[[Any], Any] = lambda errors: errors  # the file's, from the game's
+
+
+def planar(start):
+    return start["x"], Goals(start["goal"])
+
+
+def distances(errors):
+    return errors
+
+
+CASES = {
+    "rendezvous-unicycle": Case("rendezvous", planar),
+    "formation-unicycle": Case("formation", planar),
+}
+
+
+def loaded(name):
+    return json.loads((Path(__file__).parent / "golden" / f"{name}.json").read_text())
+
+
+def played(name, kind):
+    """The states, costs, failures and last success of every trajectory, by the game."""
+    case, game = CASES[name], TASKS[CASES[name].task]
+    assert isinstance(game, AbstractRegulation)
+    numbers = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, kind), tree)
+
+    def one(start, actions):
+        x, scenario = case.parts(start)
+        begin = State(x=x, scenario=scenario, t=jnp.asarray(0))
+
+        def tick(state, action):
+            after = game.step(state, action)
+            return after, (after, game.costs(state, action), game.failed(after))
+
+        last, (states, costs, failed) = jax.lax.scan(tick, begin, actions)
+        return states.x, costs, failed, game.success(last), game.errors(last)
+
+    trajectories = loaded(name)["trajectories"]
+    starts = [array(t["start"], kind) for t in trajectories]
+    run = jax.jit(one)
+    return [
+        run(s, numbers(np.array(t["actions"]))) for s, t in zip(starts, trajectories, strict=True)
+    ]
+
+
+def compared(name, kind, close):
+    case = CASES[name]
+    for told, seen in zip(loaded(name)["trajectories"], played(name, kind), strict=True):
+        x, costs, failed, success, errors = seen
+        states = [np.asarray(case.parts(array(s, np.float64))[0]) for s in told["next_states"]]
+        want = np.array(states)
+        np.testing.assert_allclose(x, want, rtol=close, atol=close * (1 + np.abs(want).max()))
+        want = np.array(told["costs"])
+        np.testing.assert_allclose(costs, want, rtol=close, atol=close * (1 + np.abs(want).max()))
+        assert np.array_equal(failed, told["failed"]), name
+        assert bool(success) == told["success_at_end"], name
+        want = np.array(told["errors_at_end"])
+        got = np.asarray(errors)
+        if CASES[name].task in ("rendezvous", "formation"):  # in the world's frame there
+            got, want = (np.linalg.norm(e[:, :2], axis=1) for e in (got, want))
+        np.testing.assert_allclose(got, want, rtol=close, atol=close * (1 + np.abs(want).max()))
+
+
+def array(tree, kind):
+    """The numbers in the file, as arrays."""
+    is_list = lambda x: isinstance(x, list)
+    return jax.tree.map(lambda x: jnp.asarray(np.array(x), kind), tree, is_leaf=is_list)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_in_double_precision_to_a_billionth(name):
+    with jax.enable_x64(True):
+        compared(name, jnp.float64, 1e-9)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_in_single_precision_to_a_ten_thousandth(name):
+    compared(name, jnp.float32, 1e-4)
