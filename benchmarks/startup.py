@@ -42,7 +42,10 @@ def main(argv=None):
     add("marlyap --help", ["-m", "marlyap", "--help"])
     add("import marlyap", ["-c", "import marlyap"])
     if not args.quick:
-        add("import JAX and all of marlyap", ["-c", "import marlyap.commands"])
+        add(
+            "import JAX and all of marlyap",
+            ["-c", "import marlyap.cli.training, marlyap.cli.claims, marlyap.film"],
+        )
         with tempfile.TemporaryDirectory() as folder:
             cache = {"JAX_COMPILATION_CACHE_DIR": str(Path(folder, "cache"))}
             train = lambda n: ["-m", "marlyap", *TRAIN.split(), "2560", "--out", f"{folder}/{n}"]

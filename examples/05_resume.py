@@ -4,8 +4,8 @@ import argparse
 from itertools import count
 from pathlib import Path
 
-from marlyap import MASAC, Lyapunov, Rendezvous, Run, Schedule, Trainer
-from marlyap.fit import fit
+from marlyap import MASAC, Lyapunov, Rendezvous, Run, Schedule, Trainer, launch
+from marlyap.events import Progress
 
 
 def main(place: Path, steps: int, **smaller: int):
@@ -16,8 +16,10 @@ def main(place: Path, steps: int, **smaller: int):
     half = -(-trainer.iterations // 2)
     for _ in range(2):
         asked = count()  # `stop` is called before every iteration
-        for event in fit([run], stop=lambda asked=asked: next(asked) >= half):
-            print(event["iteration"], round(event["return"], 2))
+        for event in launch([run], stop=lambda asked=asked: next(asked) >= half):
+            match event:
+                case Progress(line=line):
+                    print(line["iteration"], round(line["return"], 2))
         run = Run.open(place / "seed0")  # as another process would, tomorrow
         print(f"On disk: {run.steps_done:,} steps, finished: {run.finished}")
     return run

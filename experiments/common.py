@@ -23,7 +23,7 @@ import re
 import shutil
 import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,25 +32,26 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from marlyap import statistics
+from marlyap import events, statistics
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.certificates.contraction import Contraction
 from marlyap.config import fields
 from marlyap.errors import UserError
 from marlyap.evaluation import Evaluation, evaluate, share
-from marlyap.fit import fit
 from marlyap.game import AbstractGame
 from marlyap.identity import policy_hash
 from marlyap.marl_eval import document
+from marlyap.progress import show
 from marlyap.provenance import provenance
 from marlyap.report.scene import PALETTE
 from marlyap.rollout import rollout
 from marlyap.run import Run
+from marlyap.runs.launch import Launch, launch
+from marlyap.runs.stop import Stop
 from marlyap.seeds import stream
 from marlyap.store import write_text_atomic
 from marlyap.tasks import TASKS
 from marlyap.trainer import SCHEDULES, Schedule, Trainer
-from marlyap.workers import train_all
 
 
 Row = dict[str, Any]
@@ -174,7 +175,7 @@ def fill(name: str, cases: Sequence[Case], args: argparse.Namespace) -> None:
     key = lambda case, seed: tuple(str(v) for v in (*case.about.values(), seed))
     wanted = [(c, s) for c in cases for s in args.seeds if key(c, s) not in there]
     runs = {key(c, s): c.run(root, s) for c, s in wanted}
-    train(list(runs.values()), args)
+    train(list(runs.values()), args.quick)
     for case, seed in wanted:
         run = runs[key(case, seed)]
         if not run.finished:  # given up
@@ -197,25 +198,32 @@ def fill(name: str, cases: Sequence[Case], args: argparse.Namespace) -> None:
             shutil.rmtree(run.directory / "checkpoints", ignore_errors=True)
 
 
-def train(runs: list[Run], args: argparse.Namespace) -> None:
-    """Train to the end, or until a number stops being finite: those are given up."""
-    waiting = [run for run in runs if not run.finished]
-    while waiting:
-        try:
-            if args.quick:
-                for run in waiting:
-                    list(fit([run]))
-                return
-            parallel = argparse.Namespace(parallel="auto", worker=False, task="", algorithm="")
-            if code := train_all(waiting, parallel):
-                raise SystemExit(code)
-            return
-        except UserError as error:
-            gone = {run.directory for run in waiting if str(run.directory) in str(error)}
-            if not gone:
-                raise
-            print(f"given up: {error}")
-            waiting = [r for r in waiting if r.directory not in gone and not r.finished]
+def train(runs: list[Run], quick: bool) -> None:
+    """Train to the end, or until a number stops being finite: those are given up.
+
+    With `quick`, one after the other in this process.
+    """
+    given_up: list[events.Failed] = []
+
+    def kept(happening: Iterator[events.Event]) -> Iterator[events.Event]:
+        for event in happening:
+            given_up.extend([event] if isinstance(event, events.Failed) else [])
+            yield event
+
+    with Stop() as stop:
+        for some in [[run] for run in runs] if quick else [runs]:
+            if stop():
+                break
+            before = len(given_up)
+            try:
+                show(kept(launch(some, Launch(), stop)))
+            except UserError:
+                if len(given_up) == before:
+                    raise
+    for event in given_up:
+        print(f"given up: {event.says}")
+    if stop():
+        raise SystemExit(stop.code)
 
 
 @eqx.filter_jit

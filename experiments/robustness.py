@@ -73,7 +73,7 @@ def teams(args):
         chosen = [case.quick() for case in chosen[:1]]
     for case in chosen:
         runs = [case.run(args.runs / "headline", seed) for seed in args.seeds]
-        train([run for run in runs if not (run.directory / "policy").is_dir()], args)
+        train([run for run in runs if not (run.directory / "policy").is_dir()], args.quick)
         for run in runs:
             yield case.label, run.seed, run.controller()
     if not args.quick:

@@ -5,10 +5,9 @@ The names below are imported on first use, so that `import marlyap` costs nothin
 
 import sys
 from importlib import import_module
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
 
 
+TYPE_CHECKING = False  # `typing` takes longer to import than all that a command's start needs
 if TYPE_CHECKING:
     from marlyap.algorithm import AbstractOffPolicy as AbstractOffPolicy
     from marlyap.algorithms import APG as APG, MASAC as MASAC
@@ -37,6 +36,7 @@ if TYPE_CHECKING:
     from marlyap.planar import AbstractPlanar as AbstractPlanar, Goals as Goals
     from marlyap.rollout import Decentralised as Decentralised, rollout as rollout
     from marlyap.run import Run as Run
+    from marlyap.runs.launch import Launch as Launch, launch as launch
     from marlyap.tasks import Formation as Formation, Rendezvous as Rendezvous
     from marlyap.trainer import Schedule as Schedule, Trainer as Trainer
     from marlyap.types import State as State
@@ -65,6 +65,7 @@ PUBLIC = {
     "lyapunov_function": ("AbstractLyapunov",),
     "rollout": ("Decentralised", "rollout"),
     "run": ("Run",),
+    "runs.launch": ("Launch", "launch"),
     "tasks": ("Formation", "Rendezvous"),
     "trainer": ("Schedule", "Trainer"),
     "types": ("State",),
@@ -73,7 +74,7 @@ _HOME = {name: module for module, names in PUBLIC.items() for name in names}
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name == "__version__":
         from importlib.metadata import version
 
@@ -89,10 +90,10 @@ def __dir__() -> list[str]:
     return sorted([*__all__, "__version__"])
 
 
-class _Package(ModuleType):
-    def __setattr__(self, name: str, value: Any) -> None:
+class _Package(type(sys)):
+    def __setattr__(self, name: str, value: object) -> None:
         """Leave `marlyap.certify` the function when Python has imported the module of that name."""
-        if not (name in _HOME and isinstance(value, ModuleType)):
+        if not (name in _HOME and isinstance(value, type(sys))):
             super().__setattr__(name, value)
 
 

@@ -47,7 +47,7 @@ class UnknownCode(UserError):
 
 
 class NotOfThatKind(UserError):
-    """The file that was named defines no such task or algorithm."""
+    """The file that was named defines no such task, algorithm or controller."""
 
 
 def known() -> dict[str, type]:
@@ -122,6 +122,19 @@ def load_controller(word: str, game: AbstractGame) -> AbstractController:
     """
     if word in CONTROLLERS:
         return CONTROLLERS[word](game)
+    cls = controller_class(word)
+    try:
+        return cls(game)
+    except UserError:
+        raise
+    except Exception as error:  # whatever the constructor of a user's class may raise
+        raise UserError(
+            f"controller: {cls.__name__} cannot be made from a game alone: {error}."
+        ) from error
+
+
+def controller_class(word: str) -> type[AbstractController]:
+    """The class at `path/to/file.py:Name`. Raises UserError as `load_controller` does."""
     path, _, name = word.rpartition(":")
     if word.endswith(".py"):
         raise UserError(f"controller: '{word}' names no class; write {word}:Name.")
@@ -130,16 +143,11 @@ def load_controller(word: str, game: AbstractGame) -> AbstractController:
         raise UserError(f"controller: no controller is called '{word}'; {hint}")
     cls = getattr(_module(Path(path), "controller"), name, None)
     if not (inspect.isclass(cls) and issubclass(cls, AbstractController)):
-        raise UserError(
+        raise NotOfThatKind(
             f"controller: {path} defines no controller called '{name}'; write a class "
             f"{name}(AbstractController)."
         )
-    try:
-        return cls(game)
-    except UserError:
-        raise
-    except Exception as error:  # whatever the constructor of a user's class may raise
-        raise UserError(f"controller: {name} cannot be made from a game alone: {error}.") from error
+    return cls
 
 
 def override(obj: T, path: str, text: str) -> T:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from marlyap import config, devices, programs, store
+from marlyap import config, devices, events, programs, store
 from marlyap.algorithm import AbstractAlgorithm
 from marlyap.algorithms import ALGORITHMS
 from marlyap.cache import enable_cache
@@ -39,8 +39,8 @@ class Diverged(UserError):
 
 def fit(
     runs: list[Run], stop: Callable[[], bool] = lambda: False, attempts: int = 1
-) -> Iterator[dict[str, Any]]:
-    """Train `runs` to the end, or until `stop()`; yields one dict for each run and iteration.
+) -> Iterator[events.Event]:
+    """Train `runs` to the end, or until `stop()`; yields a Progress for each run and iteration.
 
     Several runs must differ in their seed alone; they advance together under `vmap`. Everything
     is saved at the end and when stopped, so that calling this again resumes bit for bit. A run in
@@ -55,7 +55,7 @@ def fit(
         yield from _fit(runs, stop, attempts)
 
 
-def _fit(runs: list[Run], stop: Callable[[], bool], attempts: int) -> Iterator[dict[str, Any]]:
+def _fit(runs: list[Run], stop: Callable[[], bool], attempts: int) -> Iterator[events.Event]:
     """Train the runs that stand at the same iteration together, one such group after the other.
 
     A damaged checkpoint or a fault may have thrown one run further back than the others.
@@ -65,7 +65,7 @@ def _fit(runs: list[Run], stop: Callable[[], bool], attempts: int) -> Iterator[d
         loaded = [_Loaded(run, *run.load()) for run in runs if not attempt or run.seed in faults]
         for one in loaded:
             one.run.rewind(one.iteration)
-            yield from ({"seed": one.run.seed, "warning": w} for w in one.warnings)
+            yield from (events.Warned(*one.run.named, w) for w in one.warnings)
         faults = {}
         for _, group in groupby(sorted(loaded, key=_iteration), key=_iteration):
             faults |= yield from _together([one.reseeded(attempt) for one in group], stop)
@@ -73,7 +73,7 @@ def _fit(runs: list[Run], stop: Callable[[], bool], attempts: int) -> Iterator[d
             break
         if attempt + 1 < attempts:
             told = f"going on from the last checkpoint with other random numbers ({attempt + 1})"
-            yield from ({"seed": seed, "warning": told} for seed in faults)
+            yield from (events.Warned(*r.named, told) for r in runs if r.seed in faults)
     if len(faults) == len(runs):
         raise next(iter(faults.values()))
 
@@ -104,7 +104,7 @@ def _iteration(loaded: _Loaded) -> int:
 
 def _together(
     loaded: list[_Loaded], stop: Callable[[], bool]
-) -> Generator[dict[str, Any], None, dict[int, Diverged]]:
+) -> Generator[events.Event, None, dict[int, Diverged]]:
     """Train runs that stand at the same iteration; returns why, for each seed that was given up."""
     faults: dict[int, Diverged] = {}
     runs, trainer = [one.run for one in loaded], loaded[0].run.trainer
@@ -124,15 +124,15 @@ def _together(
                 )
                 says = _advice(fault, line, trainer.game.agents, where) + f" in {run.directory}."
                 faults[run.seed] = Diverged(says)
-                yield {"seed": run.seed, "iteration": done, "diverged": fault, "says": says}
+                yield events.Diverged(*run.named, done, fault, says)
                 if not any(alive):
                     return faults
             if alive[i]:
                 run.log(_told(line))
-                yield _told(line) | {"iterations": trainer.iterations}
+                yield events.Progress(*run.named, _told(line), trainer.iterations)
         if saved.due():
-            saved.save(runs, carry, alive, seconds)
-    saved.save(runs, carry, alive, before + time.monotonic() - clock)
+            yield from saved.save(runs, carry, alive, seconds)
+    yield from saved.save(runs, carry, alive, before + time.monotonic() - clock)
     return faults
 
 
@@ -225,7 +225,8 @@ def train(
     last: list[Carry] = []
     history = []
 
-    def events() -> Iterator[dict[str, Any]]:
+    def happening() -> Iterator[events.Event]:
+        yield events.Started("", seed)
         clock = time.monotonic()
         first = _stack([begin(trainer, seed)])
         for done, carry, rows in advance(trainer, first):
@@ -236,12 +237,12 @@ def train(
             history.append(_told(line))
             if on_iteration:
                 on_iteration(history[-1])
-            yield history[-1] | {"iterations": trainer.iterations}
+            yield events.Progress("", seed, history[-1], trainer.iterations)
 
     if progress:
-        show(events(), [seed], plain=False)
+        show(happening(), plain=False)
     else:
-        for _ in events():
+        for _ in happening():
             pass
     carry = _row(last[0], 0)
     return Trained(
@@ -258,13 +259,17 @@ class _Saved:
     def due(self) -> bool:
         return time.monotonic() - self.at > max(PATIENCE, self.cost / SHARE)
 
-    def save(self, runs: list[Run], carry: Carry, alive: list[bool], seconds: float) -> None:
-        start = time.monotonic()
-        for i, run in enumerate(runs):
-            if alive[i]:
-                run.save(_row(carry, i), seconds)
+    def save(
+        self, runs: list[Run], carry: Carry, alive: list[bool], seconds: float
+    ) -> list[events.Event]:
+        """A checkpoint of every run that is alive; returns what to tell of it."""
+        start, sound = time.monotonic(), [i for i, well in enumerate(alive) if well]
+        for i in sound:
+            runs[i].save(_row(carry, i), seconds)
         self.at = time.monotonic()
         self.cost = self.at - start
+        done = int(np.min(carry.iteration))
+        return [events.Saved(*runs[i].named, done) for i in sound]
 
 
 def _stack(carries: list[Carry]) -> Carry:

@@ -33,6 +33,7 @@ from marlyap.identity import plain, words
 
 FOLDER = "MARLYAP_PROGRAMS"
 KIND, MOST = "program", 256  # programs kept, the last ones used
+SOURCE = Path(__file__).parent  # all of the package, since a program may depend on any of it
 
 Tree = TypeVar("Tree")
 Info = dict[str, Any]
@@ -113,7 +114,7 @@ def _digest(*parts: Any) -> str:
 def _surroundings() -> tuple[str, ...]:
     """All that tracing depends on beside its arguments."""
     source = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
+    for path in sorted(SOURCE.rglob("*.py")):
         source.update(path.read_bytes())
     settings = {k: str(v) for k, v in jax.config.values.items() if "cache" not in k}
     device = jax.devices()[0]

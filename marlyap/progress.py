@@ -1,18 +1,20 @@
-"""What a training shows while it runs."""
+"""The progress of trainings, drawn on a terminal or in a notebook."""
 
 import time
 from collections.abc import Iterable
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from marlyap import events
 
 
 QUIET = 30.0  # seconds without a line, at most, where there is no terminal
 
 
-def show(events: Iterable[dict[str, Any]], seeds: Iterable[int], plain: bool = True) -> None:
-    """A bar for each seed: steps, speed, return, success, time left.
+def show(happening: Iterable[events.Event], plain: bool = True) -> None:
+    """A bar for each run: steps, speed, return, success, time left.
 
     Where there is no terminal or notebook: with `plain`, a line at each judgement and at least
     every QUIET seconds; else nothing.
@@ -26,33 +28,49 @@ def show(events: Iterable[dict[str, Any]], seeds: Iterable[int], plain: bool = T
     )
     console = Console(stderr=True)
     bar = console.is_terminal or console.is_jupyter
-    tell = lambda seed, text: console.print(f"seed {seed}: {text}", highlight=False, soft_wrap=True)
     with Progress(*columns, console=console, disable=not bar) as progress:
-        bars, told = {}, {}
-        for seed in seeds:
-            bars[seed] = progress.add_task(f"seed {seed}", total=None, text="compiling")
-            told[seed] = time.monotonic()
-            if plain and not bar:
-                tell(seed, "compiling")
-        seen: dict[int, dict[str, Any]] = {}
-        for e in events:
-            if "warning" in e or "diverged" in e:
-                what = e.get("warning") or e["says"]
-                tell(e["seed"], what)
-                continue
-            first = seen.setdefault(e["seed"], e)
-            if e["steps"] < first["steps"]:  # another run of the same seed
-                first = seen[e["seed"]] = e
-            seconds = e["seconds"] - first["seconds"]
-            speed = f"{(e['steps'] - first['steps']) / seconds:,.0f}/s  " if seconds > 0 else ""
-            success = e.get("success", first.get("last"))
-            first["last"] = success
-            text = f"{e['steps']:,} steps  {speed}return {e['return']:.2f}"
-            text += f"  success {100 * success:.1f} %" if success is not None else ""
-            progress.update(
-                bars[e["seed"]], total=e["iterations"], completed=e["iteration"], text=text
-            )
-            quiet = time.monotonic() - told[e["seed"]]
-            if plain and not bar and ("success" in e or quiet > QUIET):
-                told[e["seed"]] = time.monotonic()
-                tell(e["seed"], text)
+        seen: dict[tuple[str, int], _Shown] = {}
+        for event in happening:
+            who = event.run, event.seed
+            if who not in seen:
+                names = {one.name for one in seen.values()}
+                name = f"seed {event.seed}"
+                name = event.run if name in names else name  # several runs of one seed
+                seen[who] = _Shown(name, progress.add_task(name, total=None, text="compiling"))
+            shown = seen[who]
+            match event:
+                case events.Warned() | events.Diverged():
+                    text, aloud = event.says, True
+                case events.Started():
+                    text, aloud = "compiling", plain and not bar
+                case events.Progress():
+                    text = shown.text(event.line)
+                    done, total = event.line["iteration"], event.iterations
+                    progress.update(shown.bar, total=total, completed=done, text=text)
+                    due = "success" in event.line or time.monotonic() - shown.told > QUIET
+                    aloud = plain and not bar and due
+                case _:
+                    continue
+            if aloud:
+                shown.told = time.monotonic()
+                console.print(f"{shown.name}: {text}", highlight=False, soft_wrap=True)
+
+
+class _Shown:
+    """What was shown of one run: its bar, and the last line about it."""
+
+    def __init__(self, name: str, bar: TaskID):
+        self.name, self.bar, self.told = name, bar, time.monotonic()
+        self.first: dict[str, Any] = {}
+        self.success: float | None = None
+
+    def text(self, line: dict[str, Any]) -> str:
+        """Steps, speed since the first line, return and the last success."""
+        self.first = self.first or line
+        self.success = line.get("success", self.success)
+        seconds = line["seconds"] - self.first["seconds"]
+        speed = (line["steps"] - self.first["steps"]) / seconds if seconds > 0 else 0.0
+        text = f"{line['steps']:,} steps  "
+        text += f"{speed:,.0f}/s  " if speed > 0 else ""
+        text += f"return {line['return']:.2f}"
+        return text + (f"  success {100 * self.success:.1f} %" if self.success is not None else "")

@@ -6,6 +6,9 @@ from functools import cache
 from pathlib import Path
 
 
+SOURCE = Path(__file__).parent  # all of the package
+
+
 @cache
 def provenance() -> dict[str, str]:
     """Machine, processor and commit as text; empty where one is not known.
@@ -27,9 +30,8 @@ def _cpu() -> str:
 
 def _commit() -> str:
     def git(*words: str) -> str:
-        here = Path(__file__).parent
         return subprocess.check_output(
-            ["git", "-C", str(here), *words], text=True, stderr=subprocess.DEVNULL, timeout=10
+            ["git", "-C", str(SOURCE), *words], text=True, stderr=subprocess.DEVNULL, timeout=10
         ).strip()
 
     try:

@@ -183,6 +183,11 @@ class Run:
         return self.trainer.game
 
     @property
+    def named(self) -> tuple[str, int]:
+        """Directory and seed: how an event names its run."""
+        return str(self.directory), self.seed
+
+    @property
     def labels(self) -> dict[str, str]:
         """`names` to be shown: of path/to/file.py:Name the Name alone."""
         return {part: name.rpartition(":")[2] for part, name in self.names.items()}
@@ -371,3 +376,11 @@ def _bits(leaf: jax.Array) -> jax.Array:
 
 def _from_bits(value: jax.Array, dtype: Any) -> jax.Array:
     return jax.random.wrap_key_data(value) if jnp.issubdtype(dtype, jax.dtypes.prng_key) else value
+
+
+def one_run(word: Path | str) -> Path:
+    """The one run at this place. Raises UserError where there is none, or several."""
+    found = expand([Path(word)])
+    if len(found) > 1:
+        raise UserError(f"run: {word} holds {len(found)} runs; name one, such as {found[0]}.")
+    return found[0]

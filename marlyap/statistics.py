@@ -136,16 +136,6 @@ def lower_bound(successes: Counts, trials: Counts, confidence: Any) -> Reals:
     return _lower(k, n, 1.0 - _fraction("confidence", confidence))
 
 
-def upper_bound(successes: Counts, trials: Counts, confidence: Any) -> Reals:
-    """Exact one-sided upper confidence bound on a success probability.
-
-    The p at which P(X <= successes) equals 1 - confidence; 1 when successes = trials.
-    Arguments, shapes, errors raised and source are those of `lower_bound`.
-    """
-    k, n = _counts(successes, trials)
-    return _upper(k, n, 1.0 - _fraction("confidence", confidence))
-
-
 def clopper_pearson(successes: Counts, trials: Counts, confidence: Any = 0.95) -> Interval:
     """Exact two-sided interval on a success probability, with (1 - confidence) / 2 in each tail.
 
@@ -172,21 +162,6 @@ def trials_needed(epsilon: Any, confidence: Any) -> int:
     ratio = math.log1p(-confidence) / math.log1p(-epsilon)
     # The slack keeps a ratio that is whole in decimals, as at (0.9, 0.99), from rounding up by one.
     return max(1, math.ceil(ratio * (1.0 - 1e-12)))
-
-
-def wilson(successes: Counts, trials: Counts, confidence: Any = 0.95) -> Interval:
-    """Score interval on a success probability: shorter than the exact one, nominal on average only.
-
-    Arguments, shapes and errors raised are those of `lower_bound`. It has no continuity correction.
-    Source: Wilson, "Probable inference, the law of succession, and statistical inference", JASA 22,
-    1927; recommended by Agresti and Coull, The American Statistician 52, 1998.
-    """
-    k, n = _counts(successes, trials)
-    z = -scipy.special.ndtri((1.0 - _fraction("confidence", confidence)) / 2.0)
-    centre = (k + z**2 / 2.0) / (n + z**2)
-    half = z * np.sqrt(k * (n - k) / n + z**2 / 4.0) / (n + z**2)
-    high = np.where(k == n, 1.0, centre + half)  # Free of rounding, as the low end is at k = 0.
-    return Interval(_scalar(centre - half), _scalar(high))
 
 
 def mcnemar(a: Any, b: Any) -> PairedTest:
@@ -228,33 +203,6 @@ def iqm(scores: Any) -> float:
     ordered = np.sort(_numbers("scores", scores, None, 1, finite=True), axis=None)
     cut = ordered.size // 4
     return float(ordered[cut : ordered.size - cut].mean())
-
-
-def stratified_bootstrap(
-    scores: Any,
-    statistic: Callable[[Any], float] = iqm,
-    confidence: Any = 0.95,
-    resamples: Any = 2000,
-    seed: Any = 0,
-) -> Interval:
-    """Percentile bootstrap interval that resamples the runs of each task on their own.
-
-    The tasks stay fixed. With few runs (under about 10) it covers less than its nominal confidence.
-
-    Arguments: scores, finite Float["run task"] with at least 2 runs; statistic, from such a matrix
-    to a float; confidence in (0, 1); resamples, at least 1; seed of the resampling.
-    Raises: StatisticsError (a UserError and a ValueError) when an argument breaks these limits.
-    Source: Agarwal et al., NeurIPS 2021; Efron, "Bootstrap methods", Annals of Statistics 7, 1979.
-    """
-    scores = _numbers("scores", scores, 2, 2, finite=True)
-    confidence = _fraction("confidence", confidence)
-    resamples, rng = _positive_integer("resamples", resamples), np.random.default_rng(seed)
-    runs, tasks = scores.shape
-    replicates = [
-        float(statistic(scores[rng.integers(runs, size=(runs, tasks)), np.arange(tasks)]))
-        for _ in range(resamples)
-    ]
-    return _percentiles(np.asarray(replicates), confidence)
 
 
 def two_level_bootstrap(
@@ -325,9 +273,9 @@ def mean_bound(values: Any, confidence: Any) -> float:
     n + 1 weights (Dirichlet(1, ..., 1)): what the mean would be if the distribution put random
     masses between the ordered values, always at the upper end of each gap. The density of that sum
     is a B-spline with the ordered values as its knots, so the quantile is found without sampling.
-    For values of 0 and 1 it is `upper_bound`, and for one value Markov's inequality. For n > 1
-    and other values its coverage is conjectured, not proved; no counterexample is known, and
-    reliability/coverage.py searches for one.
+    For values of 0 and 1 it is the one-sided bound of Clopper and Pearson, and for one value
+    Markov's inequality. For n > 1 and other values its coverage is conjectured, not proved; no
+    counterexample is known, and reliability/coverage.py searches for one.
 
     Arguments: values, Float["n"], independent draws from one distribution on [0, 1]; confidence in
     (0, 1).

@@ -51,7 +51,6 @@ from marlyap.statistics import (
     mean_bound,
     mean_interval,
     probability_of_improvement,
-    stratified_bootstrap,
     two_level_bootstrap,
 )
 from marlyap.types import State
@@ -139,11 +138,10 @@ def misses(
         options = {"confidence": LEVEL, "resamples": resamples, "seed": k}
         found = {"exact, mean": outside(mean_interval(share, LEVEL), mean)}
         if seeds > 1:
-            one, two = share[:, None], others / episodes
-            better = probability_of_improvement(share, two, **options).interval
+            better = probability_of_improvement(share, others / episodes, **options).interval
             found |= {
-                "percentile, mean": outside(stratified_bootstrap(one, np.mean, **options), mean),
-                "percentile, iqm": outside(stratified_bootstrap(one, iqm, **options), middle),
+                "percentile, mean": outside(percentile(share, np.mean, **options), mean),
+                "percentile, iqm": outside(percentile(share, iqm, **options), middle),
                 "two-level, mean": outside(two_level_bootstrap(counts, np.mean, **options), mean),
                 "two-level, iqm": outside(two_level_bootstrap(counts, iqm, **options), middle),
                 "probability of improvement": outside(better, 0.5),
@@ -151,6 +149,20 @@ def misses(
         for name, missed in found.items():
             count[name] = count.get(name, 0) + missed
     return {name: missed / repetitions for name, missed in count.items()}
+
+
+def percentile(
+    share: np.ndarray,
+    statistic: Callable[[np.ndarray], Any],
+    confidence: float,
+    resamples: int,
+    seed: int,
+) -> np.ndarray:
+    """The usual bootstrap: quantiles of the statistic over seeds drawn with replacement."""
+    drawn = np.random.default_rng(seed).integers(len(share), size=(resamples, len(share)))
+    return np.quantile(
+        [statistic(share[row]) for row in drawn], [(1 - confidence) / 2, (1 + confidence) / 2]
+    )
 
 
 def intervals(quick: bool) -> list[dict[str, Any]]:

@@ -31,13 +31,13 @@ GUARDS = [
     ),
     Guard(
         "2 SIGTERM",
-        "marlyap/workers.py",
+        "marlyap/runs/stop.py",
         (("for s in (signal.SIGINT, signal.SIGTERM)}", "for s in (signal.SIGINT,)}"),),
         "tests/test_resume.py::test_what_is_stopped_says_how_to_go_on",
     ),
     Guard(
         "3 SIGINT",
-        "marlyap/workers.py",
+        "marlyap/runs/stop.py",
         (("return self.signal != 0", "return False"),),
         "tests/test_resume.py::test_what_is_stopped_says_how_to_go_on",
     ),
@@ -194,8 +194,8 @@ GUARDS = [
     ),
     Guard(
         "21 one diverged seed of several (processes)",
-        "marlyap/workers.py",
-        (("            failed.append(said", "            raise UserError(said"),),
+        "marlyap/runs/launch.py",
+        (("                    failed.append(said", "                    raise UserError(said"),),
         "tests/test_resume.py::test_a_process_that_fails_leaves_the_other_seeds_alone",
     ),
     Guard(

@@ -10,7 +10,8 @@ import pytest
 
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
-SCRIPTS = sorted(p.stem for p in FOLDER.glob("*.py") if p.stem not in ("harness", "peer_benchmarl"))
+OTHERS = ("harness", "peer_benchmarl", "house")
+SCRIPTS = sorted(p.stem for p in FOLDER.glob("*.py") if p.stem not in OTHERS)
 COLUMNS = {
     "agents": {"agents", "updates/s", "growth"},
     "checkpoint": {"agents", "transitions", "save s", "share %"},
@@ -86,3 +87,25 @@ def test_needed_is_counted_by_hand(benchmarks):
     critic = 2 * (4 + 1 + 1)  # 4-1-1-1
     want = (3 * actor - 2 * 2) + actor + 2 * (critic + (3 * critic - 2 * 4) + 2 * critic)
     assert needed(one, Shape(agents=1, obs=2, features=3, errors=2, du=1)) == want
+
+
+def test_the_layout_is_counted(benchmarks):
+    files = {
+        "marlyap/__init__.py": "from marlyap.games.game import play\n",
+        "marlyap/errors.py": "import os\n",
+        "marlyap/games/__init__.py": "",
+        "marlyap/games/plant.py": "from marlyap import errors\n",
+        "marlyap/games/game.py": "def play():\n    import marlyap.games.plant\n    return 1\n",
+        "marlyap/runs/run.py": "from marlyap.games import game\nfrom marlyap.errors import x, y\n",
+    }
+    assert benchmarks("house")["counts"](files) == {
+        "folders": 2,
+        "modules beside the folders": 1,
+        "files": 5,
+        "lines": 8,
+        "arrows between units": 3,  # games to errors, runs to games and to errors
+        "depth of imports": 3,
+        "longest file": "marlyap/games/game.py (3)",
+        "longest function": "marlyap/games/game.py: play (3)",
+        "functions of more than 40 lines": 0,
+    }

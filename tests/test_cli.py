@@ -5,6 +5,7 @@ import importlib
 import io
 import json
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -16,7 +17,8 @@ import numpy as np
 import pytest
 
 from marlyap import config, store
-from marlyap.cli import main, parser
+from marlyap.cli import main
+from marlyap.cli.parser import VERBS as TABLE
 from marlyap.game import AbstractGame
 from marlyap.run import Run
 
@@ -26,7 +28,7 @@ TINY = """--task.agents 2 --task.horizon 4 --task.dynamics single-integrator --s
 --schedule.environments 2 --schedule.steps_per_update 4 --schedule.warmup 8 --schedule.capacity 40
 --schedule.judge_every 4 --schedule.judge_episodes 4
 --algorithm.actor_width 4 --algorithm.critic_width 4 --algorithm.batch 4""".split()
-VERBS = sorted(next(a for a in parser()._actions if a.dest == "verb").choices)
+VERBS = sorted(TABLE)
 
 
 def call(capsys, *argv):
@@ -67,10 +69,8 @@ def contents(directory):
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
-    """Each test works in a directory of its own, with MARLYAP's variables unset."""
+    """Each test works in a directory of its own."""
     monkeypatch.chdir(tmp_path)
-    for name in ("MARLYAP_CORE", "MARLYAP_WORKER"):
-        monkeypatch.delenv(name, raising=False)
 
 
 @pytest.fixture(scope="module")
@@ -120,12 +120,9 @@ def test_help_comes_at_once_and_without_jax(argv):
     assert seconds < 0.5
 
 
-def test_every_verb_is_in_the_help_and_has_work(capsys):
-    from marlyap import commands
-
+def test_every_verb_is_in_the_help(capsys):
     code, out, _ = call(capsys)
     assert code == 0 and all(verb in out for verb in VERBS)
-    assert set(commands.VERBS) == set(VERBS)
 
 
 def test_the_version(capsys):
@@ -236,17 +233,17 @@ def test_a_gpu_that_is_not_there_is_said(tmp_path):
 
 
 def test_a_demo_of_no_steps_is_refused(capsys, monkeypatch):
-    from marlyap import commands
+    from marlyap.cli import training
 
-    monkeypatch.setattr(commands, "train_all", lambda runs, args: 130)
+    monkeypatch.setattr(training, "follow", lambda runs, how: 130)
     refused(capsys, "demo", "--steps", "0", parts=["steps: 0 is out of range"])
 
 
 @pytest.mark.parametrize("what", ["--task.agents", "--schedule.steps", "--steps", "--preset"])
 def test_resume_refuses_what_it_would_ignore(what, unfinished, capsys, monkeypatch):
-    from marlyap import commands
+    from marlyap.cli import training
 
-    monkeypatch.setattr(commands, "train_all", lambda runs, args: 0)
+    monkeypatch.setattr(training, "follow", lambda runs, how: 0)
     value = "paper" if what == "--preset" else "3"
     refused(capsys, "train", "--resume", unfinished, what, value, parts=[what])
 
@@ -287,9 +284,9 @@ def test_a_directory_one_may_not_write_in(tmp_path, capsys):
 
 
 def test_force_makes_the_run_anew(run, capsys, monkeypatch):
-    from marlyap import commands
+    from marlyap.cli import training
 
-    monkeypatch.setattr(commands, "train_all", lambda runs, args: 0)
+    monkeypatch.setattr(training, "follow", lambda runs, how: 0)
     code, _, _ = call(capsys, *TRAIN, "--out", run.parent, "--force", *TINY)
     assert code == 0 and sorted(contents(run)) == ["run.json"]
 
@@ -300,9 +297,9 @@ def test_all_places_are_checked_before_any_is_made(run, capsys):
 
 
 def test_force_does_not_destroy_a_run_in_use(run, capsys, monkeypatch):
-    from marlyap import commands
+    from marlyap.cli import training
 
-    monkeypatch.setattr(commands, "train_all", lambda runs, args: 0)
+    monkeypatch.setattr(training, "follow", lambda runs, how: 0)
     before = contents(run)
     with store.lock(run):
         refused(capsys, *TRAIN, "--out", run.parent, "--force", *TINY, parts=["in use"])
@@ -594,6 +591,34 @@ def test_list_prints_one_object(capsys):
     assert code == 0 and all(name in out for family in found.values() for name in family)
 
 
+def test_list_shows_whole_sentences(capsys):
+    found = strict(call(capsys, "list", "--json")[1])
+    del found["presets"]
+    for family in found.values():
+        for text in family.values():
+            assert re.fullmatch(r"[A-Z{].*\.( \(.*\))?", text), text
+
+
+LAW = """
+from marlyap.controllers import Zero
+from marlyap.game import AbstractGame
+
+class Push(Zero):
+    game: AbstractGame
+    gain: float = 0.5  # inputs for each metre
+"""
+
+
+def test_list_shows_the_gains_of_a_controller_of_ones_own(tmp_path, capsys):
+    (tmp_path / "law.py").write_text(LAW)
+    code, out, _ = call(capsys, "list", "law.py:Push", "--json")
+    assert code == 0 and strict(out) == {
+        "gain": {"value": "0.5", "meaning": "inputs for each metre"}
+    }
+    parts = ["law.py defines no task, algorithm or controller called 'Pull'"]
+    refused(capsys, "list", "law.py:Pull", parts=parts)
+
+
 def test_list_of_one_prints_one_object(capsys):
     code, out, _ = call(capsys, "list", "rendezvous", "--json")
     assert code == 0 and strict(out)["--task.agents"]["value"] == "3"
@@ -632,15 +657,21 @@ def test_two_seeds_train_in_two_processes(tmp_path, capsys, monkeypatch):
     assert any(a[key].tobytes() != b[key].tobytes() for key in a)
 
 
-def test_code_of_ones_own_reaches_the_processes(own, tmp_path, capsys, monkeypatch):
+def test_code_of_ones_own_reaches_the_processes(own, capsys, monkeypatch):
+    from marlyap.runs import launch
+    from marlyap.runs.job import Job
+
     class Started(BaseException):
         pass
 
-    def start(command, **_):
-        raise Started(command)
+    def say(child, line):
+        raise Started(line)
 
-    monkeypatch.setattr(subprocess, "Popen", start)
+    monkeypatch.setattr(launch, "WORKER", (sys.executable, "-c", ""))
+    monkeypatch.setattr(launch._Child, "say", say)
     command = ["train", own, "masac", "--out", "out", "--seeds", "0", "1", *TINY]
     with pytest.raises(Started) as started:
-        main([*command, "--parallel", "process"])
-    assert own in started.value.args[0]
+        main([*command, "--parallel", "process", "--on-nan", "rollback"])
+    job = Job.from_json(started.value.args[0])
+    assert job.run == "out/seed0" and job.core is not None and job.how.tries == 3
+    assert (job.how.task, job.how.algorithm) == (own, None)

@@ -17,6 +17,7 @@ import marlyap
 # within which imports must not go in circles. A new module needs one line here.
 FLOORS = """
     errors
+    events
     cache
     progress
     types
@@ -61,9 +62,8 @@ FLOORS = """
     marl_eval
     diagnose
     fit
-    workers
+    runs
     report
-    commands
     cli
     __main__
 """.split()

@@ -9,8 +9,7 @@ import time
 
 import pytest
 
-from marlyap import cli
-from marlyap.cli import main
+from marlyap.cli import entry, interrupts, main
 
 
 TINY = """--task.horizon 4 --steps 16 --schedule.environments 2 --schedule.steps_per_update 4
@@ -27,8 +26,9 @@ def run(tmp_path_factory):
 
 WATCHED = """
 from marlyap import cli
-watch = cli.on_interrupt_exit
-cli.on_interrupt_exit = lambda: (watch(), print("ready", flush=True))
+from marlyap.cli import interrupts
+watch = interrupts.on_interrupt_exit
+interrupts.on_interrupt_exit = lambda: (watch(), print("ready", flush=True))
 cli.program()
 """
 
@@ -98,9 +98,9 @@ def test_every_verb_ends_in_one_line(run, tmp_path, verb):
 
 def test_two_threads_that_are_told_say_it_once(capfd, monkeypatch):
     """Python's handler and the watching thread can both be told of one signal."""
-    monkeypatch.setattr(cli, "ENDING", threading.Lock())
+    monkeypatch.setattr(interrupts, "ENDING", threading.Lock())
     monkeypatch.setattr(os, "_exit", lambda code: None)
-    both = [threading.Thread(target=cli.exit_interrupted) for _ in range(2)]
+    both = [threading.Thread(target=interrupts.exit_interrupted) for _ in range(2)]
     for thread in both:
         thread.start()
     for thread in both:
@@ -112,14 +112,15 @@ def test_in_process_an_interrupt_is_a_code(monkeypatch, capfd):
     def stop(argv):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "command", stop)
+    monkeypatch.setattr(entry, "command", stop)
     assert main(["list"]) == 130
     assert "marlyap: interrupted; " in capfd.readouterr().err
 
 
 def test_an_interrupt_that_python_does_not_come_to_still_ends_it(tmp_path):
     """A thread is told of the signal while the main one is in one long call of C."""
-    script = "from marlyap import cli; cli.on_interrupt_exit(); print('ready', flush=True); "
+    script = "from marlyap.cli.interrupts import on_interrupt_exit; on_interrupt_exit(); "
+    script += "print('ready', flush=True); "
     script += "import hashlib; hashlib.pbkdf2_hmac('sha256', b'a', b'b', 2 * 10**7)"
     with subprocess.Popen(
         [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -129,3 +130,35 @@ def test_an_interrupt_that_python_does_not_come_to_still_ends_it(tmp_path):
         os.kill(child.pid, signal.SIGINT)
         _, said = child.communicate()
     assert child.returncode == 130 and "nothing was written" in said
+
+
+EARLY = """
+import os, signal, sys
+
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == sys.argv[1]:
+            os.kill(os.getpid(), signal.SIGINT)
+
+for name in [n for n in sys.modules if n.partition('.')[0] in ('argparse', 'pathlib')]:
+    del sys.modules[name]
+sys.meta_path.insert(0, Interrupting())
+from marlyap.cli import program
+program()
+"""
+
+
+@pytest.mark.parametrize("module", ["argparse", "pathlib", "marlyap.cli.entry", "marlyap.errors"])
+def test_an_interrupt_while_the_command_line_is_imported_is_one_line(module):
+    """The handler stands before anything else is imported."""
+    command = [sys.executable, "-c", EARLY, module]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 130, done.stderr
+    assert done.stderr == "\nmarlyap: interrupted; nothing was written.\n"
+
+
+def test_next_to_nothing_is_imported_before_the_handler_stands():
+    script = "import importlib, signal, sys; before = {*sys.modules}; "
+    script += "from marlyap.cli import program; print(*sorted({*sys.modules} - before))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout == "marlyap marlyap.cli\n", done

@@ -205,14 +205,15 @@ def test_what_is_wrong_with_an_option(argv, part, capsys):
 
 @pytest.mark.parametrize("flip", [False, True])
 def test_the_order_of_overrides_does_not_matter(flip):
-    from marlyap.cli import parse
-    from marlyap.commands import assemble
+    from marlyap.cli.parser import parse
+    from marlyap.cli.training import Asked, assemble
 
     words = ["--task.leaders", "4"], ["--task.agents", "5"]
     more = ["--algorithm.constraint.reading", "hinge"], ["--algorithm.constraint", "lyapunov"]
     pairs = [*words, *more, ["--steps", "1e3"]]
     argv = sum(reversed(pairs) if flip else pairs, [])
-    trainer = assemble(*parse([*TRAIN, *argv]))
+    args, overrides = parse([*TRAIN, *argv])
+    trainer = assemble(Asked(args.task, args.algorithm, args.preset, args.steps), overrides)
     assert (trainer.game.agents, trainer.game.leaders) == (5, (4,))
     assert trainer.schedule.steps == 1000
     assert trainer.algorithm.constraint.reading == "hinge"  # pyright: ignore
@@ -276,15 +277,14 @@ def test_help_has_examples_that_can_be_parsed():
     import shlex
 
     from marlyap.algorithms import ALGORITHMS
-    from marlyap.cli import EXAMPLES, parse, parser
+    from marlyap.cli.parser import VERBS, parse
     from marlyap.controllers import CONTROLLERS
     from marlyap.tasks import TASKS
 
     known = {*TASKS, *ALGORITHMS, *CONTROLLERS}
-    verbs = next(a for a in parser()._actions if a.dest == "verb").choices
-    assert set(EXAMPLES) == set(verbs or ())
-    for verb, text in EXAMPLES.items():
-        for line in text.strip().splitlines():
+    for verb, file in VERBS.items():
+        assert file.EXAMPLES.strip()
+        for line in file.EXAMPLES.strip().splitlines():
             words = shlex.split(line)
             args, _ = parse(words[1:])
             assert words[0] == "marlyap" and args.verb == verb

@@ -1,6 +1,7 @@
 """A program that was traced once is found again, unless anything it was made from is another."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap import programs
+import marlyap
+from marlyap import programs, provenance
 from marlyap.learn import Learnt
 from marlyap.store import MANIFEST, PAYLOAD
 from marlyap.tasks import TASKS
@@ -95,16 +97,39 @@ def test_another_program_is_traced(change, folder):
     assert len(TRACES) == 2
 
 
+def copied(tmp_path):
+    """A copy of the package's source."""
+    return shutil.copytree(
+        programs.SOURCE, tmp_path / "marlyap", ignore=shutil.ignore_patterns("__pycache__")
+    )
+
+
+def change(path):
+    path.write_bytes(path.read_bytes() + b"\n")
+
+
+def test_a_change_in_any_file_of_the_package_is_noticed(monkeypatch, tmp_path):
+    package = Path(marlyap.__file__).parent
+    assert programs.SOURCE == provenance.SOURCE == package
+    monkeypatch.setattr(programs, "SOURCE", copied(tmp_path))
+    digests, files = set(), [p for p in package.rglob("*.py") if "__pycache__" not in p.parts]
+    try:
+        for path in files:
+            change(programs.SOURCE / path.relative_to(package))
+            programs._surroundings.cache_clear()
+            digests.add(programs._surroundings()[0])
+    finally:
+        programs._surroundings.cache_clear()
+    assert len(digests) == len(files)
+
+
 @pytest.mark.parametrize("what", ["source", "version", "setting", "device"])
 def test_what_surrounds_a_program_belongs_to_its_name(what, folder, monkeypatch, tmp_path):
     compiled()
     programs._surroundings.cache_clear()
     if what == "source":
-        copy = tmp_path / "marlyap"
-        copy.mkdir()
-        for path in Path(programs.__file__).parent.glob("*.py"):
-            (copy / path.name).write_bytes(path.read_bytes() + b"\n" * (path.name == "nets.py"))
-        monkeypatch.setattr(programs, "__file__", str(copy / "programs.py"))
+        monkeypatch.setattr(programs, "SOURCE", copied(tmp_path))
+        change(next(programs.SOURCE.rglob("nets.py")))
     elif what == "version":
         monkeypatch.setattr(programs.store, "versions", lambda: {"jax": "0"})
     elif what == "device":

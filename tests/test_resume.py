@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import time
-from argparse import Namespace
 from collections import Counter, deque
 from pathlib import Path
 
@@ -22,15 +21,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap import programs, store, workers
+from marlyap import config, events, programs, store
 from marlyap.algorithms import ALGORITHMS, MASAC
 from marlyap.cli import main
 from marlyap.constraints import Lyapunov
 from marlyap.dynamics import SingleIntegrator
 from marlyap.errors import UserError
-from marlyap.fit import Diverged, advance, fit
+from marlyap.fit import Diverged, advance, fit as fit_runs
+from marlyap.game import AbstractGame
 from marlyap.rollout import first_fault
 from marlyap.run import Run, begin, flatten
+from marlyap.runs import launch as launching
+from marlyap.runs.job import Job, Launch
 from marlyap.tasks import Rendezvous
 from marlyap.trainer import Schedule, Trainer
 
@@ -69,6 +71,13 @@ def until(iterations):
     """A `stop` that says so after this many iterations."""
     asked = itertools.count()
     return lambda: next(asked) >= iterations
+
+
+def fit(*args, **kwargs):
+    """What `fit` tells, of a Progress its line of the log; checkpoints are looked at on disk."""
+    for event in fit_runs(*args, **kwargs):
+        if not isinstance(event, events.Saved):
+            yield event.line if isinstance(event, events.Progress) else event
 
 
 def final(run):
@@ -139,8 +148,8 @@ def test_a_stopped_run_ends_bit_for_bit_like_an_uninterrupted_one(
         assert [run.checkpoints.latest().step for run in made] == [done] * len(seeds)
     runs = [Run.open(run.directory) for run in made]
     assert [run.finished for run in runs] == [done == 6] * len(seeds)
-    events = list(fit(runs))
-    assert [e["iteration"] for e in events if e["seed"] == 5] == [*range(done + 1, 7)]
+    lines = list(fit(runs))
+    assert [e["iteration"] for e in lines if e["seed"] == 5] == [*range(done + 1, 7)]
     for run, whole in zip(runs, uninterrupted(name, seeds), strict=True):
         assert final(run) == whole
         assert [line["iteration"] for line in run.history()] == [1, 2, 3, 4, 5, 6]
@@ -213,10 +222,12 @@ def test_every_kind_of_end_is_a_checkpoint(eager, uninterrupted, tmp_path):
 
 def test_a_generator_that_is_dropped_leaves_a_run_to_go_on_with(eager, uninterrupted, tmp_path):
     (run,) = runs_in(tmp_path, "masac", SINGLE)
-    events = fit([run])
-    seen = [next(events) for _ in range(4)]
-    assert seen[-1]["iteration"] == 4
-    events.close()  # as a raised exception would; the fourth iteration is not yet saved
+    lines = fit_runs([run])
+    while next(lines) != events.Saved(*run.named, 3):
+        pass
+    progress = next(lines)
+    assert isinstance(progress, events.Progress) and progress.line["iteration"] == 4
+    lines.close()  # pyright: ignore  # as a raised exception would; the fourth iteration is not yet saved
     assert run.checkpoints.latest().step == 3
     list(fit([run]))  # and the lock is free
     assert final(run) == uninterrupted("masac", SINGLE)[0]
@@ -243,9 +254,9 @@ def test_the_newest_checkpoint_damaged_costs_its_iterations_and_a_warning(uninte
     for _ in range(2):
         list(fit([run], until(2)))
     spoil(run, 4)
-    first, *events = fit([Run.open(run.directory)])
-    assert "Checkpoint 4 was passed over" in first["warning"] and first["seed"] == 5
-    assert [e["iteration"] for e in events] == [3, 4, 5, 6]
+    first, *lines = fit([Run.open(run.directory)])
+    assert "Checkpoint 4 was passed over" in first.says and first.seed == 5
+    assert [e["iteration"] for e in lines] == [3, 4, 5, 6]
     assert final(run) == uninterrupted("masac", SINGLE)[0]
 
 
@@ -266,9 +277,10 @@ def test_one_of_a_pair_falling_back_does_not_mislead_the_other(uninterrupted, tm
     for _ in range(2):
         list(fit(runs, until(2)))
     spoil(runs[1], 4)
-    events = list(fit([Run.open(run.directory) for run in runs]))
-    assert [e["iteration"] for e in events if e["seed"] == 5] == [5, 6]
-    assert [e["iteration"] for e in events[1:] if e["seed"] == 6] == [3, 4, 5, 6]
+    warned, *lines = fit([Run.open(run.directory) for run in runs])
+    assert isinstance(warned, events.Warned) and warned.run == str(runs[1].directory)
+    assert [e["iteration"] for e in lines if e["seed"] == 5] == [5, 6]
+    assert [e["iteration"] for e in lines if e["seed"] == 6] == [3, 4, 5, 6]
     for run, whole in zip(runs, uninterrupted("masac", PAIR), strict=True):
         assert run.checkpoints.latest().step == 6
         assert [line["iteration"] for line in run.history()] == [1, 2, 3, 4, 5, 6]
@@ -286,11 +298,11 @@ def test_a_log_ahead_of_the_checkpoint_or_cut_short_is_mended(uninterrupted, tmp
 
 def test_a_directory_that_vanishes_in_mid_run_is_said(tmp_path):
     (run,) = runs_in(tmp_path, "masac", SINGLE)
-    events = fit([run])
-    next(events)
+    lines = fit([run])
+    next(lines)
     shutil.rmtree(run.directory)
     with pytest.raises(UserError, match="could not be written .*; make sure"):
-        list(events)
+        list(lines)
     assert not run.directory.exists()
 
 
@@ -347,12 +359,12 @@ def test_a_diverged_seed_does_not_touch_its_neighbour(uninterrupted, tmp_path, m
     list(fit(runs, until(2)))
     before = contents(runs[1].directory)
     poison(monkeypatch, {6})
-    events = list(fit(runs))
-    (fault,) = [e for e in events if "diverged" in e]
-    assert (fault["seed"], fault["iteration"]) == (6, 3)
-    assert fault["diverged"] in ("J_Q", "J_pi", "alpha")
-    assert re.search(r"\(seed 6\), first in the .* in update 1 of iteration 3;", fault["says"])
-    assert [(e["seed"], e["iteration"]) for e in events if e is not fault] == [
+    told = list(fit(runs))
+    (fault,) = [e for e in told if isinstance(e, events.Diverged)]
+    assert (fault.run, fault.seed, fault.iteration) == (*runs[1].named, 3)
+    assert fault.quantity in ("J_Q", "J_pi", "alpha")
+    assert re.search(r"\(seed 6\), first in the .* in update 1 of iteration 3;", fault.says)
+    assert [(e["seed"], e["iteration"]) for e in told if e is not fault] == [
         (5, 3),
         (5, 4),
         (5, 5),
@@ -371,11 +383,11 @@ def test_when_all_diverge_training_stops_and_the_checkpoints_stay(tmp_path, monk
     list(fit(runs, until(2)))
     before = [contents(run.directory) for run in runs]
     poison(monkeypatch, {5, 6})
-    events = []
+    told = []
     with pytest.raises(Diverged, match=r"iteration 3 \(seed \d\).*lower the learning rates"):
         for event in fit(runs):
-            events.append(event)
-    assert [e["seed"] for e in events] == [5, 6]
+            told.append(event)
+    assert [e.seed for e in told] == [5, 6]
     assert [contents(run.directory) for run in runs] == before
 
 
@@ -386,9 +398,10 @@ def test_a_run_rolls_back_and_tries_other_random_numbers(uninterrupted, tmp_path
     poison(monkeypatch, {5})
     bad = Run.load
     monkeypatch.setattr(Run, "load", lambda run: (sound if next(loads) else bad)(run))
-    events = list(fit([run], attempts=2))
-    assert [e.get("iteration") for e in events] == [3, None, 3, 4, 5, 6]
-    assert "diverged" in events[0] and "with other random numbers" in events[1]["warning"]
+    fault, warned, *lines = fit([run], attempts=2)
+    assert isinstance(fault, events.Diverged) and fault.iteration == 3
+    assert isinstance(warned, events.Warned) and "with other random numbers" in warned.says
+    assert [line["iteration"] for line in lines] == [3, 4, 5, 6]
     assert [line["iteration"] for line in run.history()] == [1, 2, 3, 4, 5, 6]
     found, whole = final(run), uninterrupted("masac", SINGLE)[0]
     assert found["log"][:2] == whole["log"][:2] and found["log"][2] != whole["log"][2]
@@ -460,24 +473,114 @@ def test_the_first_fault_of_an_episode():
     assert divmod(int(first_fault(jnp.asarray(x))), 2) == (2, 1)
 
 
+LOUD = """
+from marlyap.dynamics import SingleIntegrator
+from marlyap.tasks import Rendezvous
+
+class Loud(Rendezvous):
+    agents: int = 2
+    horizon: int = 4
+    dynamics: SingleIntegrator = SingleIntegrator()
+
+    def costs(self, state, action):
+        print("loud")
+        return super().costs(state, action)
+"""
+
+
 def test_a_process_that_fails_leaves_the_other_seeds_alone(tmp_path, monkeypatch):
     """Seed 5 ends at once with an error, seed 6 goes on; then the error is told."""
-    runs = runs_in(tmp_path, "masac", PAIR)
-    work = "import time; time.sleep(0.5); print('{\"seed\": 6}')"
-    fail = "import sys; sys.exit('marlyap: J_Q: it diverged.')"
-
-    def spawn(run, core, args):
-        code = fail if run.seed == 5 else work
-        pipe = subprocess.PIPE
-        return subprocess.Popen([sys.executable, "-c", code], stdout=pipe, stderr=pipe, text=True)
-
-    monkeypatch.setattr(workers, "_spawn", spawn)
+    five, six = runs = runs_in(tmp_path, "masac", PAIR)
+    fault, done = events.Failed(*five.named, "J_Q: it diverged."), events.Finished(*six.named)
+    answers = {5: (0.0, events.to_json(fault), 2), 6: (0.5, events.to_json(done), 0)}
+    script = "import json, sys, time; job = json.loads(sys.stdin.readline())\n"
+    script += f"wait, text, code = {answers}[int(job['run'][-1])]\n"
+    script += "time.sleep(wait); print(text); sys.exit(code)"
+    monkeypatch.setattr(launching, "WORKER", (sys.executable, "-c", script))
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
-    events = []
+    told = []
     with pytest.raises(UserError, match="^J_Q: it diverged.$"):
-        for event in workers._processes(runs, workers.Stop(), Namespace()):
-            events.append(event)
-    assert events == [{"seed": 6}]
+        for event in launching.launch(runs, Launch("process")):
+            told.append(event)
+    assert told == [events.Started(*five.named), events.Started(*six.named), fault, done]
+
+
+def test_a_process_that_is_killed_is_told_with_its_last_words(tmp_path, monkeypatch):
+    """However much it says on standard error: nobody reads that before it has ended."""
+    runs = runs_in(tmp_path, "masac", PAIR)
+    script = "import os, sys; print('x' * 200_000 + '\\nthe end', file=sys.stderr, flush=True); "
+    script += "os.kill(os.getpid(), 9)"
+    monkeypatch.setattr(launching, "WORKER", (sys.executable, "-c", script))
+    says = f"^{runs[0].directory}: its process ended with code -9 \\(the end\\); resume it"
+    with pytest.raises(UserError, match=says):
+        list(launching.launch(runs, Launch("process")))
+
+
+WAITS = """
+import sys
+from marlyap import events
+from marlyap.runs.job import Job
+job = Job.from_json(sys.stdin.readline())
+for line in sys.stdin:
+    if line == "stop\\n":
+        sys.exit(143)
+    raise AssertionError(line)
+open(job.run + "/orphan", "w").close()  # the end of the input: the parent is gone
+"""
+
+
+def test_processes_are_asked_to_stop_and_waited_for(tmp_path, monkeypatch):
+    runs = runs_in(tmp_path, "masac", PAIR)
+    monkeypatch.setattr(launching, "WORKER", (sys.executable, "-c", WAITS))
+    started = [events.Started(*run.named) for run in runs]
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    assert list(launching.launch(runs, Launch("process"), until(4))) == started
+    happening = launching.launch(runs, Launch("process"))
+    assert [next(happening) for _ in runs] == started
+    happening.close()  # pyright: ignore
+    assert not list(tmp_path.rglob("orphan"))
+
+
+def test_a_process_hears_that_its_parent_was_killed(tmp_path):
+    runs = runs_in(tmp_path, "masac", PAIR)
+    script = "import os, sys; from marlyap import Run; from marlyap.runs import launch as l; "
+    script += f"l.WORKER = (sys.executable, '-c', {WAITS!r}); "
+    script += "l.os.sched_getaffinity = lambda _: {0, 1}; "
+    script += "happening = l.launch([Run.open(p) for p in sys.argv[1:]], l.Launch('process')); "
+    script += "next(happening); next(happening); os.kill(os.getpid(), 9)"
+    places = [str(run.directory) for run in runs]
+    subprocess.run([sys.executable, "-c", script, *places], timeout=120)
+    deadline = time.monotonic() + 60
+    while len(list(tmp_path.rglob("orphan"))) < 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_a_worker_does_its_job_and_obeys(tmp_path):
+    """The real one: a job on its input, events on its output, and what a task prints elsewhere."""
+    (tmp_path / "own.py").write_text(LOUD)
+    game = config.load(f"{tmp_path}/own.py:Loud", AbstractGame)
+    small = dataclasses.replace(trainer("masac"), game=game)
+    run = Run.create(tmp_path / "seed5", small, 5, {"task": "Loud"})
+    how = launching._with_code(run, Launch())
+    assert how.task == f"{tmp_path}/own.py:Loud" and how.algorithm is None
+    with subprocess.Popen(
+        launching.WORKER, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, env=os.environ | {"JAX_PLATFORMS": "cpu"},
+    ) as child:  # fmt: skip
+        assert child.stdin is not None and child.stdout is not None
+        child.stdin.write(Job(str(run.directory), None, how).to_json() + "\n")
+        child.stdin.flush()
+        told = [events.from_json(child.stdout.readline())]
+        child.stdin.write("stop\n")
+        child.stdin.flush()
+        told += [events.from_json(line) for line in child.stdout]
+        assert child.stderr is not None and "loud" in child.stderr.read()
+        code = child.wait()
+    done = max(e.line["iteration"] for e in told if isinstance(e, events.Progress))
+    assert code == (143 if done < 6 else 0) and run.checkpoints.latest().step == done
+    assert events.Saved(*run.named, done) in told
+    assert (events.Finished(*run.named) in told) == (done == 6)
 
 
 def test_runs_side_by_side_go_by_their_settings_and_faults_are_told_at_the_end(monkeypatch):
@@ -497,16 +600,17 @@ def test_runs_side_by_side_go_by_their_settings_and_faults_are_told_at_the_end(m
     def fit(group, stop, attempts):
         groups.append([(r.trainer, r.seed) for r in group])
         for r in group:
-            event = {"seed": r.seed, "steps": 8}
-            yield event if r.finished else event | {"diverged": "J_Q", "says": f"{r.directory}!"}
+            event = events.Progress(*r.named, {"steps": 8}, 1)
+            yield event if r.finished else events.Diverged(*r.named, 1, "J_Q", f"{r.directory}!")
         if not any(r.finished for r in group):
             raise Diverged("all of c!")
 
-    monkeypatch.setattr(workers, "fit", fit)
-    together = lambda runs: list(workers._side_by_side(runs, workers.Stop(), 1))
-    assert together([run("a", 0), run("b", 0), run("a", 1)]) == [
-        {"seed": s, "steps": 8} for s in (0, 1, 0)
-    ]
+    monkeypatch.setattr(launching, "fit", fit)
+    together = lambda runs: list(launching.together(runs, Launch(), lambda: False))
+    kinds = [events.Progress, events.Progress, events.Finished, events.Finished]
+    told = together([run("a", 0), run("b", 0), run("a", 1)])
+    assert [type(e) for e in told] == [*kinds, events.Progress, events.Finished]
+    assert [e.run for e in told] == ["a0", "a1", "a0", "a1", "b0", "b0"]
     assert groups == [[("a", 0), ("a", 1)], [("b", 0)]]
     with pytest.raises(UserError, match="^b1!$"):
         together([run("b", 1, False), run("b", 2), run("c", 3, False), run("d", 4)])

@@ -1,4 +1,4 @@
-"""The certificates by name, configured. A proof needs its region, so that there is none here."""
+"""The certificates by name, configured. `Proof` is not listed: it needs a region."""
 
 from marlyap.certificate import AbstractCertificate
 from marlyap.certificates.basin import Basin

@@ -39,7 +39,9 @@ def claim(
 
 
 class Basin(AbstractCertificate):
-    """C4. v is the largest level without a failure below it in one set of rollouts. Then, on a
+    """A level set of V from which the team reaches the target set and stays.
+
+    C4. v is the largest level without a failure below it in one set of rollouts. Then, on a
     fresh set and with the confidence asked for,
 
         P[ reach and stay | V(s_0) <= v ] >= bound   and   P[ V(s_0) <= v ] in `mass`,

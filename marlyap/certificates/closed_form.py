@@ -27,7 +27,9 @@ def claim(offset: float, rate: float, level: float, sampled: float) -> str:
 
 
 class ClosedForm(AbstractCertificate):
-    """C9. The points z_i = p_i + d h_i of unicycles under z_i'' = k_p e_i - k_d z_i', with
+    """Stability of the point-offset law from eigenvalues, without a rollout.
+
+    C9. The points z_i = p_i + d h_i of unicycles under z_i'' = k_p e_i - k_d z_i', with
     e = -D^-1 (L + B)(z - p*), D = diag(degree_i + b_i), and mu_k the eigenvalues of D^-1 (L + B):
 
         mu_k > 0 for all k (the grounded Laplacian is positive definite),

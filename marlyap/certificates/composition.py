@@ -33,7 +33,9 @@ def claim(bound: float, rho: float, farthest: float, steps: int, dt: float) -> s
 
 
 class Composition(AbstractCertificate):
-    """C7 (statistical small gain). With V_i the largest distance of agent i to its goal over the
+    """The team converges, from one function for each agent (statistical small gain).
+
+    C7. With V_i the largest distance of agent i to its goal over the
     next T steps and M = diag(1 - a) + Gamma >= 0, Gamma_ij > 0 for neighbours j of i only:
 
         V_i(s_{t+T}) <= (1 - a_i) V_i(s_t) + sum_j Gamma_ij V_j(s_t) + delta_i  for all i, t   (*)

@@ -37,7 +37,9 @@ def claim(bound: float, beta: float, T: int, c_min: float, least: float, steps: 
 
 
 class Contraction(AbstractCertificate):
-    """C3. With the confidence asked for, over the sampling of starts s_0 ~ rho,
+    """The cost contracts by the share beta over any T steps.
+
+    C3. With the confidence asked for, over the sampling of starts s_0 ~ rho,
 
         P[ c(s_{t+T}) <= (1 - beta) c(s_t) for all t <= H - T with c(s_t) >= c_min ] >= bound.
 

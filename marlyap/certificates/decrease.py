@@ -31,7 +31,9 @@ def claim(
 
 
 class Decrease(AbstractCertificate):
-    """C2. With the confidence asked for, over the sampling of starts s_0 ~ rho,
+    """V falls in every step until the team has arrived.
+
+    C2. With the confidence asked for, over the sampling of starts s_0 ~ rho,
 
         P[ tau <= H, and V(s_{t+1}) - V(s_t) <= -beta c_rho(s_t) for every t < tau ] >= bound,
 

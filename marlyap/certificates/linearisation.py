@@ -45,7 +45,9 @@ def claim_not(count: int, decay: float) -> str:
 
 
 class Linearisation(AbstractCertificate):
-    """Local exponential stability of "at rest on the goal", by the game's own step f and errors e:
+    """Local exponential stability at rest on the goal.
+
+    By the game's own step f and errors e:
 
         x* = f(x*, u*),  mu(x*) = u*,  e(x*) = 0,  rho(df(x, mu(x))/dx) <= 1 - margin  at x*,
 

@@ -46,7 +46,9 @@ def at_most(bound: float) -> str:
 
 
 class Quantiles(AbstractCertificate):
-    """C5. With the confidence asked for, for all three together and over s_0 ~ rho,
+    """Quantiles of the final distance, the settling time and the largest rise of V.
+
+    C5. With the confidence asked for, for all three together and over s_0 ~ rho,
 
         P[ distance at H <= d ] >= q,
         P[ settling time <= t ] >= q,

@@ -30,7 +30,9 @@ def claim_stay(bound: float, arrived: str, horizon: int, steps: int, dt: float) 
 
 
 class Reach(AbstractCertificate):
-    """C1. With the confidence asked for, over the sampling of starts s_0 ~ rho,
+    """The team is on target at the horizon.
+
+    C1. With the confidence asked for, over the sampling of starts s_0 ~ rho,
 
         P[ distance_i(s_H) <= r for every agent i ] >= bound,
 
@@ -56,7 +58,9 @@ class Reach(AbstractCertificate):
 
 
 class ReachAndStay(AbstractCertificate):
-    """C1'. With the confidence asked for, over the sampling of starts s_0 ~ rho,
+    """The team arrives by the horizon and stays.
+
+    C1'. With the confidence asked for, over the sampling of starts s_0 ~ rho,
 
         P[ there is tau <= H: distance_i(s_t) <= r for all i and tau <= t <= H + S ] >= bound,
 

@@ -46,7 +46,9 @@ def listed(without: dict[str, str]) -> str:
 
 
 class Robustness(AbstractCertificate):
-    """C6. With the confidence asked for, for all perturbations w together, over s_0 ~ rho,
+    """The team is on target at the horizon under each of several perturbations.
+
+    C6. With the confidence asked for, for all perturbations w together, over s_0 ~ rho,
 
         P[ distance_i(s_H) <= r for every agent i | w ] >= bound_w,
 

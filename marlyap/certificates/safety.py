@@ -40,7 +40,9 @@ def claim_apart(bound: float, gap: float, least: float, steps: int, dt: float) -
 
 
 class Safe(AbstractCertificate):
-    """With the confidence asked for, over the sampling of starts s_0 ~ rho,
+    """No agent violates a rule of the game.
+
+    With the confidence asked for, over the sampling of starts s_0 ~ rho,
 
         P[ no agent violates a rule of the game in s_t, for all t <= H + S ] >= bound,
 
@@ -82,7 +84,9 @@ class Safe(AbstractCertificate):
 
 
 class Apart(AbstractCertificate):
-    """With the confidence asked for, over the sampling of starts s_0 ~ rho,
+    """Agents keep a distance d from each other.
+
+    With the confidence asked for, over the sampling of starts s_0 ~ rho,
 
         P[ |p_i - p_j| >= d for all agents i != j in s_t, for all t <= H + S ] >= bound.
 

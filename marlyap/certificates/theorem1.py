@@ -35,7 +35,9 @@ def claim(bound: float, V: str) -> str:
 
 
 class Theorem1(AbstractCertificate):
-    """Let V be continuous, 0 on the target set, positive elsewhere and l_L-Lipschitz, and let
+    """{V <= c} is invariant under a new policy, by Theorem 1.
+
+    Let V be continuous, 0 on the target set, positive elsewhere and l_L-Lipschitz, and let
     f(s, .) be l_f-Lipschitz. If for every s with V(s) <= c, with alpha(V) = rate V,
 
         V(f(s, mu_old(s))) + l_L l_f |mu_new(s) - mu_old(s)| - V(s) <= -rate V(s)       (13)

@@ -1,0 +1,65 @@
+"""What `certify` is asked about, and by which certificates."""
+
+import dataclasses
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from marlyap import config
+from marlyap.certificate import AbstractCertificate
+from marlyap.certificates import CERTIFICATES
+from marlyap.certificates.safety import has_rules
+from marlyap.cli.common import Overrides, say
+from marlyap.controllers import names_a_controller
+from marlyap.errors import UserError
+from marlyap.game import AbstractGame
+from marlyap.run import one_run
+from marlyap.subject import asked, subject
+
+
+SAMPLED = ("reach", "reach-and-stay", "decrease", "contraction", "basin", "quantiles")
+
+
+def about(
+    word: str, task: str | None, algorithm: str | None, overrides: Overrides, out: Path | None
+) -> tuple[Any, AbstractGame, Path]:
+    """The controller, its game, and where the certificate goes.
+
+    `word` is a run directory or the name of a controller. Raises UserError where something is
+    missing.
+    """
+    if names_a_controller(word):
+        if task is None or out is None:
+            missing = "--task TASK" if task is None else "--out DIRECTORY"
+            raise UserError(f"certify: {word} is a controller, not a run; add {missing}.")
+        game = asked(task, overrides)
+        return config.load_controller(word, game), game, out
+    place = one_run(word)
+    run, game = subject(place, task, algorithm, overrides)
+    controller = run.controller(game)
+    for note in run.warnings:
+        say(note)
+    if game is not run.game and out is None:
+        raise UserError(
+            f"out: this certificate is not about the task that {place} was trained on; say "
+            "where it goes with --out DIRECTORY."
+        )
+    return controller, game, out or run.directory / "certificate"
+
+
+def usual(game: AbstractGame) -> tuple[str, ...]:
+    """The certificates to ask for where none is named."""
+    return (*SAMPLED, "linearisation", *(("safe",) if has_rules(game) else ()))
+
+
+def chosen(names: Iterable[str], rollouts: int | None) -> dict[str, AbstractCertificate]:
+    """The certificates by name, those of several rollouts with that many if they are given."""
+    found = {}
+    for name in names:
+        if name not in CERTIFICATES:
+            hint = config.suggest(name, CERTIFICATES)
+            raise UserError(f"certificates: there is none called '{name}'; {hint}")
+        c = CERTIFICATES[name]
+        several = rollouts is not None and "rollouts" in config.fields(c)
+        found[name] = dataclasses.replace(c, rollouts=rollouts) if several else c  # pyright: ignore
+    return found

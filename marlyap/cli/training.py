@@ -1,0 +1,149 @@
+"""Runs that are made, resumed and trained: what `train` and `demo` share."""
+
+import re
+import shutil
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from marlyap import config
+from marlyap.algorithm import AbstractAlgorithm
+from marlyap.algorithms import PRESETS
+from marlyap.cli.common import Overrides, say
+from marlyap.errors import UserError
+from marlyap.game import AbstractGame
+from marlyap.progress import show
+from marlyap.run import Run, expand
+from marlyap.runs.job import Launch
+from marlyap.runs.launch import launch
+from marlyap.runs.stop import Stop
+from marlyap.subject import supplies
+from marlyap.trainer import Trainer, schedule_for
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What the user named: task, algorithm and preset, and the environment steps of each seed."""
+
+    task: str
+    algorithm: str
+    preset: str | None = None
+    steps: int | None = None
+
+    @property
+    def names(self) -> dict[str, str]:
+        """As run.json holds them."""
+        return {
+            "task": self.task,
+            "algorithm": self.algorithm,
+            "preset": self.preset or "tuned",
+        }
+
+
+def reopened(places: Iterable[Path], task: str | None, algorithm: str | None) -> list[Run]:
+    """The runs to be resumed; `task` and `algorithm` name code of the user's own."""
+    game = config.load(task, AbstractGame) if task else None
+    rule = config.load(algorithm, AbstractAlgorithm) if algorithm else None
+    runs = [Run.open(d, game, rule) for d in expand(places)]
+    for run in runs:
+        keeps(run, {"task": task, "algorithm": algorithm}, game, rule)
+        for warning in run.warnings:
+            say(f"warning: {warning}")
+    readable(runs)
+    return runs
+
+
+def keeps(
+    run: Run,
+    named: dict[str, str | None],
+    game: AbstractGame | None,
+    rule: AbstractAlgorithm | None,
+) -> None:
+    """Raise UserError if another task or algorithm is named than the run was trained with."""
+    own_rule = rule is not None and bool(config.own_classes(run.trainer.algorithm))
+    fits = {
+        "task": game is None or supplies(named["task"] or "", game, run),
+        "algorithm": rule is None or own_rule,
+    }
+    for part, is_own in fits.items():
+        if not is_own and named[part] != run.names[part]:
+            raise UserError(
+                f"{part}: {run.directory} was trained with {run.labels[part]}, and a run that is "
+                "resumed keeps it; leave the other out."
+            )
+
+
+def readable(runs: list[Run]) -> None:
+    """Raise UserError where a finished run has no sound checkpoint left; nothing would train it."""
+    for run in runs:
+        if run.finished:
+            for warning in run.checkpoints.latest().warnings:
+                say(f"warning: {warning}")
+
+
+def create(
+    asked: Asked, overrides: Overrides, words: list[str], out: Path | None, force: bool
+) -> list[Run]:
+    """One new run for each seed, in `out` or in runs/TASK/ALGORITHM."""
+    trainer = assemble(asked, overrides)
+    safe = lambda name: Path(name.rpartition(":")[2]).stem if ":" in name else name
+    out = out or Path("runs") / safe(asked.task) / safe(asked.algorithm)
+    places = {seed: out / f"seed{seed}" for seed in seeds(words)}
+    for place in places.values():
+        Run.vacant(place, force)
+    return [Run.create(p, trainer, seed, asked.names, force) for seed, p in places.items()]
+
+
+def assemble(asked: Asked, overrides: Overrides) -> Trainer:
+    """Task, algorithm and schedule as asked for."""
+    preset = asked.names["preset"]
+    if preset not in PRESETS:
+        raise UserError(f"preset: '{preset}' is unknown; {config.suggest(preset, PRESETS)}")
+    game = config.load(asked.task, AbstractGame)
+    algorithm = PRESETS[preset](config.load(asked.algorithm, AbstractAlgorithm))
+    schedule = schedule_for(algorithm, preset)
+    parts = {"task": game, "algorithm": algorithm, "schedule": schedule}
+    parts = config.override_all(parts, overrides)
+    if asked.steps is not None:
+        parts["schedule"] = config.override(parts["schedule"], "steps", str(asked.steps))
+    return Trainer(parts["task"], parts["algorithm"], parts["schedule"])
+
+
+def seeds(words: list[str]) -> list[int]:
+    """The seeds asked for: whole numbers, each once."""
+    each = [w for word in words for w in word.split(",")]
+    for word in each:
+        if not re.fullmatch(r"[+-]?\d+", word.strip()):
+            raise UserError(f"seeds: '{word}' is not a whole number.")
+    numbers = [int(w) for w in each]
+    if len(set(numbers)) != len(numbers):
+        raise UserError(f"seeds: {' '.join(words)} names a seed twice.")
+    if not all(0 <= n < 2**31 for n in numbers):
+        raise UserError(f"seeds: {' '.join(words)} must lie between 0 and 2147483647.")
+    return numbers
+
+
+def trained(runs: list[Run], how: Launch, new: bool) -> int:
+    """Train; a new run in which training could not begin leaves no directory behind."""
+    try:
+        return follow(runs, how)
+    except BaseException:
+        for run in runs if new else ():
+            if run.untouched:
+                shutil.rmtree(run.directory, ignore_errors=True)
+                with suppress(OSError):  # as when other runs are in it
+                    run.directory.parent.rmdir()
+        raise
+
+
+def follow(runs: list[Run], how: Launch) -> int:
+    """Train and draw the progress; returns 0, or 128 + the signal that stopped it."""
+    waiting = [run for run in runs if not run.finished]
+    tell = lambda: say("\nStopping at the next checkpoint; once more to stop at once.")
+    with Stop(tell) as stop:
+        show(launch(waiting, how, stop))
+    if stop() and waiting:
+        where = " ".join(str(run.directory) for run in waiting)
+        say(f"Saved. Resume with: marlyap train --resume {where}")
+    return stop.code

@@ -1,0 +1,59 @@
+"""How trainings are to be run, as data. Nothing here imports JAX."""
+
+import dataclasses
+import json
+from dataclasses import dataclass
+
+from marlyap.errors import UserError, within
+
+
+CHOICES = {
+    "parallel": ("auto", "process", "vmap"),
+    "on_nan": ("stop", "rollback"),
+    "device": (None, "cpu", "gpu"),
+}
+
+
+@dataclass(frozen=True)
+class Launch:
+    """How `launch` runs trainings. Raises UserError for a value that is none of the choices."""
+
+    parallel: str = "auto"  # process: one run a core; vmap: one program; auto: by the device
+    on_nan: str = "stop"  # when numbers diverge: stop, or rollback to the last checkpoint
+    device: str | None = None  # cpu or gpu; None: what JAX finds
+    attempts: int = 3  # with rollback, how often a run is tried in all
+    task: str | None = None  # path/to/file.py:Name where the task is code of the user's own, and
+    algorithm: str | None = None  # likewise; None: where the run's own classes were defined
+
+    def __post_init__(self):
+        for field, choices in CHOICES.items():
+            value = getattr(self, field)
+            if value not in choices:
+                *first, last = [choice for choice in choices if choice]
+                allowed = f"{', '.join(first)} or {last}"
+                raise UserError(f"{field.replace('_', '-')}: '{value}' must be {allowed}.")
+        within("attempts", self.attempts, 1, 1000)
+
+    @property
+    def tries(self) -> int:
+        """How often a run whose numbers diverge is tried in all."""
+        return self.attempts if self.on_nan == "rollback" else 1
+
+
+@dataclass(frozen=True)
+class Job:
+    """All that a process of its own is told: which run, on which core, and how."""
+
+    run: str  # its directory
+    core: int | None
+    how: Launch
+
+    def to_json(self) -> str:
+        """One line."""
+        return json.dumps(dataclasses.asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> "Job":
+        """What `to_json` wrote."""
+        data = json.loads(text)
+        return cls(data["run"], data["core"], Launch(**data["how"]))
