@@ -43,7 +43,7 @@ from marlyap.identity import policy_hash
 from marlyap.marl_eval import document
 from marlyap.progress import show
 from marlyap.provenance import provenance
-from marlyap.report import PALETTE
+from marlyap.report.scene import PALETTE
 from marlyap.rollout import rollout
 from marlyap.run import Run
 from marlyap.runs.launch import Launch, launch

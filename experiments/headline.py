@@ -17,9 +17,10 @@ from collections import defaultdict
 
 from common import Case, at_budget, experiment, forest, options, read, schedule
 
-from marlyap import draw
 from marlyap.algorithms import ALGORITHMS, MASAC
 from marlyap.constraints import Lyapunov
+from marlyap.report.data import LogRow, Trained
+from marlyap.report.png import learning_curves_png
 from marlyap.tasks import TASKS
 
 
@@ -44,16 +45,17 @@ def curves(args, name):
     for row in read(args, f"{name}-curves"):
         if row["success"]:
             points[row["algorithm"], row["seed"]].append(row)
+    number = lambda row: [float(row[k]) for k in ("steps", "success", "return")]
     runs = [
-        {
-            "label": f"{algorithm} seed {seed}",
-            "group": algorithm,
-            "seed": int(seed),
-            "log": [{k: float(r[k]) for k in ("steps", "success", "return")} for r in rows],
-        }
+        Trained(
+            label=f"{algorithm} seed {seed}",
+            group=algorithm,
+            seed=int(seed),
+            log=tuple(LogRow(*number(row)) for row in rows),
+        )
         for (algorithm, seed), rows in sorted(points.items(), key=lambda p: names.index(p[0][0]))
     ]
-    draw.learning_curves_png(runs, args.results / f"{name}-curves.png")
+    learning_curves_png(runs, args.results / f"{name}-curves.png")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from marlyap.run import Run
 from marlyap.statistics import mean_interval
 
 
-SHARES = ("held", "at_rest", "stayed", "violations")  # of a summary, beside success
+SHARES = ("failed", "held", "at_rest", "stayed", "violations")  # of a summary, where it has them
 MOST_PAIRS = 100
 
 
@@ -176,7 +176,7 @@ def summary(members: Sequence[Measured], confidence: float = 0.95) -> dict[str, 
         return {"seeds": [members[0].seed], "about": "this policy"} | whole
     each = [m.evaluation.summary(confidence) for m in members]
     whole |= _over_seeds(members, [e["success_rate"] for e in each], confidence)
-    for name in SHARES:
+    for name in [name for name in SHARES if name in whole]:
         rates = [e[name]["success_rate"] for e in each]
         whole[name] |= _over_seeds(members, rates, confidence)
     for k, within in enumerate(whole["radii"]):

@@ -53,7 +53,7 @@ class AbstractPlant(eqx.Module):
 
     def inputs_of(self, action: Action) -> Inputs:
         """The inputs, in their units, that actions in [-1, 1] ask for; beyond that they clip."""
-        return jnp.clip(action, -1.0, 1.0) * jnp.asarray(self.limits)
+        return jnp.clip(action, -1.0, 1.0) * jnp.asarray(self.limits)[None]
 
     def step(self, x: PyTree, u: Inputs, scenario: PyTree, time: Scalar, dt: float) -> PyTree:
         """x after `dt` seconds of constant inputs."""

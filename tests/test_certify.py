@@ -9,11 +9,12 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from marlyap import film, store
+from marlyap import store
 from marlyap.algorithms import MASAC
 from marlyap.cli import main
 from marlyap.constraints import Lyapunov
 from marlyap.dynamics import SingleIntegrator
+from marlyap.report.contents import certificates
 from marlyap.run import Run
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.trainer import Schedule, Trainer
@@ -47,7 +48,7 @@ def certified(run):
 
 @pytest.fixture
 def page(run, certified):
-    return film.certificates(run, run.game, "")
+    return certificates(run, run.game, "")
 
 
 def said(capsys, *words):
@@ -77,22 +78,22 @@ def test_it_agrees_with_itself(run, certified, capsys):
 
 
 def test_the_report_has_the_claims_the_worst_starts_and_the_slices_of_V(page, certified):
-    assert [c["name"] for c in page["certificates"]] == list(NAMES)
-    for c in page["certificates"]:
-        verdict = certified["verdicts"][c["name"]]
-        assert (c["claim"], c["bound"], c["holds"]) == tuple(
-            verdict[k] for k in ("claim", "bound", "holds")
-        )
+    assert [c.name for c in page.claims] == list(NAMES)
+    for c in page.claims:
+        verdict = certified["verdicts"][c.name]
+        assert (c.claim, c.bound, c.holds) == tuple(verdict[k] for k in ("claim", "bound", "holds"))
     worst = certified["verdicts"]["reach"]["worst"]
-    (shown,) = [f for f in page["films"] if "worst for reach" in f["label"]]
-    np.testing.assert_allclose(shown["start"], worst["episode"])
-    first = np.asarray(shown["positions"])[0]
+    (shown,) = [f for f in page.films if "worst for reach" in f.label]
+    assert int(shown.start) == worst["episode"]
+    first = shown.frames.positions[0]
     np.testing.assert_allclose(first, np.asarray(worst["state"]["x"])[:, :2], atol=1e-4)
-    assert not shown["success"] and len(shown["lyapunov"]) == len(shown["positions"])
-    assert [s["label"] for s in page["slices"]] == ["agent 0, a leader", "agent 1, a follower"]
-    for part in page["slices"]:  # levels of V around the goal: the lower, the nearer
-        reach = [np.abs(np.concatenate(c["lines"])).max() for c in part["contours"] if c["lines"]]
-        assert reach == sorted(reach) and len(reach) >= 3
+    assert not shown.success and (shown.level_name, shown.rises) == ("V", True)
+    assert [s.label for s in page.slices] == ["agent 0, a leader", "agent 1, a follower"]
+    for part in page.slices:  # V is least at the goal and grows away from it
+        middle = len(part.values) // 2
+        assert part.values[middle, middle] == part.values.min()
+        for ray in (part.values[middle, middle:], part.values[middle::-1, middle]):
+            assert np.all(np.diff(ray) >= 0) and ray[-1] > ray[0]
 
 
 def test_a_certificate_of_another_policy_is_not_shown(run, certified, tmp_path):
@@ -101,7 +102,7 @@ def test_a_certificate_of_another_policy_is_not_shown(run, certified, tmp_path):
     carry = other.load()[0]
     bias = lambda c: c.best.pi.net.layers[-1].bias
     other.save(eqx.tree_at(bias, carry, bias(carry) + 0.5), 0.0)
-    assert film.certificates(other, other.game, "")["certificates"] == []
+    assert certificates(other, other.game, "").claims == ()
 
 
 def test_bad_certificates_are_one_sentence(run, certified, tmp_path, capsys):

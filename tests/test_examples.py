@@ -55,7 +55,7 @@ def test_compare():
 
 def test_evaluate_and_draw(run, tmp_path):
     summary = load("04_evaluate_and_draw").main(run.directory, tmp_path)
-    assert summary["episodes"] == 500
+    assert summary.episodes == 500
     assert (tmp_path / "film.gif").read_bytes()[:3] == b"GIF"
     assert (tmp_path / "starts.png").stat().st_size > 1000
     assert "<canvas" in (tmp_path / "report.html").read_text()

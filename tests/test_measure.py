@@ -7,9 +7,10 @@ import resource
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
-from marlyap import draw, store
+from marlyap import store
 from marlyap.algorithms import MASAC
 from marlyap.certificates.reach import Reach
 from marlyap.certify import certify, save
@@ -17,6 +18,9 @@ from marlyap.cli import main
 from marlyap.constraints import Lyapunov
 from marlyap.dynamics import SingleIntegrator
 from marlyap.errors import UserError
+from marlyap.report.data import Film, Frames, LogRow, Trained
+from marlyap.report.gif import film_gif, film_pair_gif
+from marlyap.report.png import learning_curves_png, trajectories_png
 from marlyap.run import Run, flatten
 from marlyap.schedule import Schedule
 from marlyap.source import shape
@@ -211,13 +215,14 @@ def test_a_full_disk_costs_no_picture_that_was_there(runs, capsys):
 
 
 def test_each_picture_is_whole_or_as_it_was(tmp_path):
-    film = {"positions": [[[0.0, k / 10], [1.0, 1 - k / 10]] for k in range(9)], "label": "one"}
-    log = [{"steps": s, "success": s / 9, "return": -1.0} for s in range(9)]
+    places = np.array([[[0.0, k / 10], [1.0, 1 - k / 10]] for k in range(9)])
+    film = Film(frames=Frames(times=np.arange(9.0), positions=places), label="one")
+    run = Trained(group="g", log=tuple(LogRow(s, s / 9, -1.0) for s in range(9)))
     writers = {
-        "paths.png": lambda path: draw.trajectories_png([film], path),
-        "curves.png": lambda path: draw.learning_curves_png([{"group": "g", "log": log}], path),
-        "film.gif": lambda path: draw.film_gif(film, path),
-        "pair.gif": lambda path: draw.film_pair_gif(film, film, path),
+        "paths.png": lambda path: trajectories_png([film], path),
+        "curves.png": lambda path: learning_curves_png([run], path),
+        "film.gif": lambda path: film_gif(film, path),
+        "pair.gif": lambda path: film_pair_gif(film, film, path),
     }
     for name, write in writers.items():
         (tmp_path / name).write_bytes(b"old")

@@ -27,11 +27,11 @@ from marlyap.certify import certify, save
 from marlyap.dynamics import SingleIntegrator
 from marlyap.errors import UserError
 from marlyap.evaluation import evaluate, outcomes
-from marlyap.film import strip
 from marlyap.lyapunov_function import AbstractLyapunov, CostSum
 from marlyap.perturb import Perturbed
 from marlyap.planar import AbstractPlanar, Goals
 from marlyap.recheck import recheck
+from marlyap.report.episodes import film
 from marlyap.rollout import Decentralised, rollout
 from marlyap.seeds import stream
 from marlyap.tasks import Rendezvous
@@ -243,12 +243,12 @@ def test_an_agent_of_a_game_that_judges_the_whole_team_cannot_be_taken_away():
 
 def test_what_is_drawn_is_what_the_game_says(oracle):
     path = rollout(GAME, LAW, GAME.reset(jax.random.split(KEYS[0])[0]), KEYS[0], 7)
-    drawn = strip(GAME, path, None)
-    assert np.allclose(drawn["positions"], oracle[0]["positions"][:7], atol=1e-6)
-    assert np.allclose(drawn["distance"], oracle[0]["distance"][:7], atol=1e-6)
-    assert np.allclose(drawn["cost"], oracle[0]["cost"][:7], atol=1e-5)
-    assert drawn["success"] == bool(oracle[0]["success"][6])
-    assert drawn["edges"][1] == [] and drawn["edges"][0] == [[0, 1], [1, 2]]
+    drawn = film(GAME, path)
+    assert np.allclose(drawn.frames.positions, oracle[0]["positions"][:7], atol=1e-6)
+    assert np.allclose(drawn.distance, oracle[0]["distance"][:7], atol=1e-6)
+    assert np.allclose(drawn.level, oracle[0]["cost"][:7], atol=1e-5)
+    assert drawn.success == bool(oracle[0]["success"][6])
+    assert drawn.frames.links[1] == () and drawn.frames.links[0] == ((0, 1), (1, 2))
 
 
 def test_training_plays_and_selects_by_what_the_game_says():

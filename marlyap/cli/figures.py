@@ -11,13 +11,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from marlyap import config, film, groups, store
+from marlyap import config, groups, store
 from marlyap.certificate import arrival
 from marlyap.certificates.safety import has_rules
 from marlyap.cli.common import Overrides
 from marlyap.controllers import CONTROLLERS, names_a_controller
 from marlyap.errors import UserError
 from marlyap.evaluation import RESTS, evaluate
+from marlyap.report.contents import progress
 from marlyap.run import Run, expand
 from marlyap.subject import asked, subject
 
@@ -58,7 +59,7 @@ def measured(
         notes += run.warnings
         result = evaluate(there, run.controller(there), episodes, starts)
         found.append(groups.of_run(run, result, starts, there, named.task or ""))
-        done, whole = film.progress(run)
+        done, whole = progress(run)
         if done < whole:
             notes.append(f"{directory}: training is unfinished ({done} of {whole} steps).")
         if groups.same_game(there, run.game):

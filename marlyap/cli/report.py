@@ -1,11 +1,12 @@
 """`marlyap report`: one page about runs."""
 
+import dataclasses
 import shlex
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from marlyap.cli.common import Overrides, Result, say, starts_of
 from marlyap.cli.environment import prepare
@@ -49,29 +50,32 @@ def write(
 
     `task` is what the user called the games, where they are not the runs' own.
     """
-    from marlyap import draw, film, store
-    from marlyap.report import Page, html
+    from marlyap import store
+    from marlyap.report.contents import gather
+    from marlyap.report.page import html
+    from marlyap.report.png import learning_curves_png, trajectories_png
 
     if out.exists() and not is_report(out):
         raise UserError(f"out: {out} exists and is not a report of marlyap; choose another file.")
     command = shlex.join(["marlyap", *sys.argv[1:]])
-    page = film.page(list(runs), episodes, starts, command, list(games), task)
-    store.write_text_atomic(out, html(cast(Page, page)))
+    page = gather(list(runs), episodes, starts, command, list(games), task)
+    store.write_text_atomic(out, html(page))
     pictures = [out.with_name(f"{out.stem}-{name}") for name in ("starts.png", "learning.png")]
-    draw.trajectories_png(page["films"], pictures[0])
-    draw.learning_curves_png(page["runs"], pictures[1])
+    trajectories_png(page.films, pictures[0])
+    learning_curves_png(page.runs, pictures[1])
     say(f"Report: {out.resolve()}")
-    for note in page["notes"]:
+    for note in page.notes:
         say(note)
-    result = {"start_seed": page["starts"], "groups": page["groups"]}
-    if len(page["groups"]) == 1:
-        result = {k: v for k, v in page["groups"][0].items() if k != "text"} | result
+    told: list[dict[str, Any]] = [dataclasses.asdict(group) for group in page.groups]
+    result: dict[str, Any] = {"start_seed": page.starts, "groups": told}
+    if len(told) == 1:
+        result = {k: v for k, v in told[0].items() if k != "text"} | result
     return result | {"report": str(out), "pictures": [str(p) for p in pictures]}
 
 
 def is_report(path: Path) -> bool:
     """Whether a file was written by `report`, and may be replaced by it."""
-    from marlyap.report import MARK
+    from marlyap.report.data import MARK
 
     try:
         with path.open("rb") as file:

@@ -1,7 +1,6 @@
 """`marlyap watch`: one episode as a film."""
 
 from argparse import ArgumentParser, Namespace
-from typing import cast
 
 from marlyap.cli.common import Overrides, Result, say, starts_of
 from marlyap.cli.environment import prepare
@@ -29,8 +28,11 @@ def options(p: ArgumentParser) -> None:
 def run(args: Namespace, overrides: Overrides) -> Result:
     """Film one episode."""
     prepare()
-    from marlyap import draw, film, groups, store
-    from marlyap.report import Film, Page, html
+    from marlyap import groups, store
+    from marlyap.report.data import Page
+    from marlyap.report.episodes import one
+    from marlyap.report.gif import film_gif
+    from marlyap.report.page import html
     from marlyap.run import one_run
     from marlyap.subject import subject
 
@@ -39,15 +41,14 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     if not place.is_dir():
         raise UserError(f"out: there is no directory {place}.")
     starts = starts_of(args.seed)
-    shot = film.one(run, args.episode, starts, game=game)
+    shot = one(run, args.episode, starts, game=game)
     gif, page = place / "film.gif", place / "film.html"
-    draw.film_gif(cast(Film, shot), gif)
+    film_gif(shot, gif)
     title = f"One episode of {run.title}"
     about = f"start {args.episode} of the held-out starts of seed {starts}"
     if game is not run.game:
         about += f", on {groups.told(run.game, game, args.task or '')}"
-    text = html(cast(Page, {"title": title, "subtitle": about, "films": [shot]}))
-    store.write_text_atomic(page, text)
+    store.write_text_atomic(page, html(Page(title=title, subtitle=about, films=(shot,))))
     say(f"Film: {page.resolve()} and {gif.resolve()}")
     done = {"gif": str(gif), "html": str(page), "start_seed": starts}
-    return done | {"success": bool(shot["success"])}, 0
+    return done | {"success": bool(shot.success)}, 0

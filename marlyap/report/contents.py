@@ -1,0 +1,284 @@
+"""What a report says of runs: their evaluations, films, certificates and how they were made."""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from marlyap import groups, store
+from marlyap.certificate import percent
+from marlyap.errors import UserError
+from marlyap.evaluation import evaluate
+from marlyap.game import AbstractGame, regulated
+from marlyap.identity import plain, policy_hash
+from marlyap.lyapunov_function import CostSum
+from marlyap.report.changes import changed_fields, command_of, common
+from marlyap.report.data import (
+    Claim,
+    Comparison,
+    Difference,
+    Film,
+    Group,
+    LogRow,
+    Page,
+    Share,
+    Slice,
+    Trained,
+    Training,
+    Within,
+)
+from marlyap.report.episodes import films, worst_case
+from marlyap.report.slices import slices
+from marlyap.run import Run
+
+
+MEASURED = (
+    "Measured, not proved: the interval is about {what} in this simulation, from starts drawn as "
+    "in training. {more}"
+)
+MOST_FILMED = 4  # configurations, the first run of each
+MOST_COMPARED = 12
+
+
+def gather(
+    runs: Sequence[Run],
+    episodes: int,
+    seed: int,
+    command: str = "",
+    games: Sequence[AbstractGame] | None = None,
+    called: str = "",
+) -> Page:
+    """Everything that a report shows of these runs.
+
+    `games` has the game that each is measured on, by default its own, and `called` is the name of
+    that game where it is not the one that a run was trained on.
+    """
+    found = []
+    for run, game in zip(runs, games or [run.game for run in runs], strict=True):
+        result = evaluate(game, run.controller(game), episodes, seed)
+        found.append(groups.of_run(run, result, seed, game, called))
+    names, labels = groups.labels(found, brief=True)
+    team_of = dict(zip(names, groups.grouped(found).values(), strict=True))
+    of = {m.name: (run, label) for m, run, label in zip(found, runs, labels, strict=True)}
+    alone = len(runs) == 1
+    whose = lambda m: "" if alone else of[m.name][1]
+    certified = [certificates(of[m.name][0], m.game, whose(m)) for m in found]
+    shown = [claim for c in certified for claim in c.claims]
+    teams = [_group(name, members, bool(shown)) for name, members in team_of.items()]
+    leads = [members[0] for members in team_of.values()][:MOST_FILMED]
+    filmed = [shot for m in leads for shot in films(of[m.name][0], m, whose(m))]
+    apart = groups.differing([members[0].configuration for members in team_of.values()])
+    notes = [
+        note
+        for m, c in zip(found, certified, strict=True)
+        for note in (*_missing(of[m.name][0]), *c.notes)
+    ]
+    return Page(
+        title=_title(runs, found),
+        subtitle=_subtitle(found, teams),
+        generated=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
+        starts=seed,
+        groups=tuple(teams),
+        runs=tuple(
+            _trained(of[m.name][0], m, of[m.name][1], name)
+            for name, members in team_of.items()
+            for m in members
+        ),
+        films=(*filmed, *(shot for c in certified for shot in c.films)),
+        comparisons=tuple(
+            Comparison(of[p["a"]][1], of[p["b"]][1], p["only_a"], p["only_b"], p["p_value"])
+            for p in groups.comparisons(found)[:MOST_COMPARED]
+        ),
+        claims=tuple(shown),
+        slices=tuple(part for c in certified for part in c.slices),
+        notes=tuple(notes),
+        config=common([m.configuration for m in found]),
+        changed=tuple(sorted({name for run in runs for name in changed_fields(run)})),
+        differing=tuple(
+            Difference(name, fields)
+            for name, fields in zip(team_of, apart, strict=True)
+            if len(team_of) > 1
+        ),
+        training=tuple(_training(run, label) for run, label in of.values()),
+        versions=store.versions(),
+        command=command,
+    )
+
+
+def figures(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of `data.Figures` out of the summary of an evaluation or a group."""
+    known = [name for name in groups.SHARES if name in summary]
+    shares = {name: Share(**_about_share(summary[name])) for name in known}
+    within = [Within(radius=r["radius"], **_about_share(r)) for r in summary["radii"]]
+    return {**summary, **shares, "radii": tuple(within)}
+
+
+def _about_share(part: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: part[name] for name in ("episodes", "successes", "success_rate", "interval")}
+
+
+def _group(label: str, members: Sequence[groups.Measured], certified: bool) -> Group:
+    """What is said of runs that belong together."""
+    said = groups.summary(members)
+    text = _caveat(said["about"], certified)
+    return Group(label=label, text=text, **figures(said))
+
+
+def _trained(run: Run, measured: groups.Measured, label: str, group: str) -> Trained:
+    """One run, what its evaluation found and what its log says."""
+    log = tuple(
+        LogRow(line["steps"], line.get("success"), line.get("return"))
+        for line in history(run)[0]
+        if "steps" in line
+    )
+    said = figures(measured.evaluation.summary())
+    return Trained(name=measured.name, label=label, group=group, seed=run.seed, log=log, **said)
+
+
+def _title(runs: Sequence[Run], found: Sequence[groups.Measured]) -> str:
+    if len(bases := {m.base for m in found}) == 1:
+        return bases.pop()
+    names = lambda part: sorted({run.labels[part] for run in runs})
+    return f"{' and '.join(names('task'))}: {', '.join(names('algorithm'))}"
+
+
+def _subtitle(found: Sequence[groups.Measured], teams: Sequence[Group]) -> str:
+    count = lambda n, what: f"{n} {what}{'s' * (n != 1)}"
+    sizes = {(m.game.agents, len(m.game.informed)) for m in found}
+    leaders = lambda n, told: f", {count(told, 'leader')}" if told < n else ""
+    parts = [count(n, "agent") + leaders(n, told) for n, told in sizes] * (len(sizes) == 1)
+    parts.append(count(len(found), "run"))
+    parts += [count(len(teams), "configuration")] * (len(teams) > 1)
+    return "; ".join(parts)
+
+
+def _caveat(about: str, certified: bool) -> str:
+    """What the interval is about, and what is certified beside it."""
+    one = about == "this policy"
+    what = "the share of starts from which this policy succeeds"
+    if not one:
+        what = "the expected success rate of a policy that is trained with a new seed,"
+    more = "What is certified, and on what evidence, stands below."
+    return MEASURED.format(
+        what=what, more=more if certified else "Stability is not certified by it."
+    )
+
+
+def _missing(run: Run) -> list[str]:
+    """What a report of this run has to do without."""
+    why, (done, whole) = history(run)[1], progress(run)
+    place = run.directory
+    lacks = [f"{place}: learning curves are missing or cut short: {why}."] if why else []
+    if done < whole:
+        lacks.append(f"{place}: training is unfinished ({done} of {whole} steps).")
+    return [*run.warnings, *lacks]
+
+
+def _training(run: Run, label: str) -> Training:
+    """When and with what a run was made, and the command that makes it again."""
+    about = store.read_json(run.directory / "run.json")
+    versions = about.get("versions") if isinstance(about.get("versions"), dict) else {}
+    seconds = [line.get("seconds") for line in history(run)[0][-1:]]
+    return Training(
+        name=label,
+        command=command_of(run),
+        made=str(about.get("created") or ""),
+        seed=run.seed,
+        seconds=seconds[0] if seconds else None,
+        policy=policy_hash(run.controller())[:12],
+        versions={str(k): str(v) for k, v in versions.items()},
+    )
+
+
+def progress(run: Run) -> tuple[int, int]:
+    """Environment steps done, by the log where the checkpoints are gone, and steps in all."""
+    steps = [line["steps"] for line in history(run)[0] if isinstance(line.get("steps"), int)]
+    whole = run.trainer.iterations * run.trainer.steps_per_iteration
+    return max([run.steps_done, *steps[-1:]]), whole
+
+
+def history(run: Run) -> tuple[list[dict[str, Any]], str]:
+    """The log of a run as far as it can be read, and in words what it lacks."""
+    try:
+        lines = run.history()
+    except UserError as error:
+        return [], f"log.jsonl cannot be read ({error})"
+    if not lines:
+        return [], "log.jsonl is missing, empty or cut off"
+    policy = run.directory / "policy"
+    logged, known = lines[-1].get("iteration", 0), 0
+    if policy.is_dir():
+        known = store.read(policy, "policy")[1].get("iteration", 0)
+    if logged < known:
+        return lines, f"log.jsonl ends at iteration {logged} of {known}"
+    return lines, ""
+
+
+@dataclass(frozen=True)
+class Certified:
+    """What `certify` left beside a run: its claims, its worst cases as films, its V in slices."""
+
+    claims: tuple[Claim, ...] = ()
+    films: tuple[Film, ...] = ()
+    slices: tuple[Slice, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def certificates(run: Run, game: AbstractGame, label: str) -> Certified:
+    """What is certified of a run.
+
+    A certificate of another policy or another game than these is left out, and a note says so. So
+    is V that is not a cost sum.
+    """
+    place, controller = run.directory / "certificate", run.controller(game)
+    if not place.is_dir():
+        return Certified()
+    try:
+        _, meta = store.read(place, "certificate")
+    except UserError as error:
+        return Certified(notes=(f"{run.directory}: its certificate is left out: {error}",))
+    other = "policy" * (meta["policy"] != policy_hash(run.controller()))
+    if other or meta["game"] != plain(game):
+        other = other or "game"
+        note = f"{run.directory}: its certificate is left out, because it is of another {other}."
+        return Certified(notes=(note,))
+    V, there = None, regulated(game)
+    if meta["V"]["kind"] == "CostSum":
+        V = CostSum(controller=controller, T=meta["V"]["T"], ball=meta["V"]["ball"])
+    worst: dict[tuple[str, int], list[str]] = {}
+    for name, verdict in meta["verdicts"].items():
+        case = verdict["worst"] or {}
+        if {"purpose", "episode"} <= {*case} and "change" not in case:
+            worst.setdefault((case["purpose"], case["episode"]), []).append(name)
+    level = meta["verdicts"].get("basin", {}).get("figures", {}).get("level")
+    return Certified(
+        claims=tuple(_claim(name, v, label) for name, v in meta["verdicts"].items()),
+        films=tuple(
+            worst_case(
+                there,
+                controller,
+                V,
+                meta["seed"],
+                *case,
+                label=f"worst for {', '.join(names)}",
+                run=label,
+            )
+            for case, names in worst.items()
+        ),
+        slices=() if V is None else slices(there, V, level, label),
+    )
+
+
+def _claim(name: str, verdict: Mapping[str, Any], run: str) -> Claim:
+    """A verdict as it is shown."""
+    known = {k.replace("_", " "): v for k, v in verdict["scope"].items() if v is not None}
+    said = {k: verdict[k] for k in ("claim", "evidence", "holds", "bound", "confidence")}
+    asked, bound = verdict["figures"].get("share_asked"), verdict["bound"]
+    return Claim(
+        name=name,
+        run=run,
+        asked=asked,
+        shown=None if asked is None or bound is None else percent(bound),
+        scope=", ".join(f"{k}: {v}" for k, v in known.items()),
+        **said,
+    )

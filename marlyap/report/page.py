@@ -1,0 +1,167 @@
+"""One self-contained HTML page that says how good a team is and shows it moving.
+
+`html` is a pure function from data to text: no JAX, no network, no files but the package's own
+`page.html`, `style.css` and `player.js`. Every text is escaped, and the page's security policy
+allows only the package's own script.
+"""
+
+import base64
+import hashlib
+import json
+from collections.abc import Sequence
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from markupsafe import Markup
+
+from marlyap.report import charts, plot, words
+from marlyap.report.data import Claim, Figures, Group, Page, Slice
+from marlyap.report.scene import PALETTE, Scene, played, scenes
+
+
+MOST_SHOWN = 6  # episodes whose paths are drawn
+SQUARE, WIDE = (3.6, 3.6), (3.9, 2.6)  # inches
+
+
+def html(page: Page) -> str:
+    """The whole report as the text of one HTML file."""
+    shown, script = scenes(page.films), _own("player.js")
+    radii = sorted({radius for run in page.runs for radius, *_ in charts.within(run)})
+    return _template().render(
+        page=page,
+        policy=_policy(script),
+        style=_own("style.css"),
+        script=script,
+        scenes=shown,
+        films=_json([played(scene) for scene in shown]),
+        starts=[(scene, _paths(scene, f"s{k}-")) for k, scene in enumerate(shown[:MOST_SHOWN])],
+        charts=[(c.caption, _chart(c, f"c{k}-")) for k, c in enumerate(charts.charts(page.runs))],
+        names=charts.legend(page.runs),
+        slices=[(part, _slice(part, f"v{k}-")) for k, part in enumerate(page.slices)],
+        tints=[k % len(PALETTE) for k in charts.colours(page.runs)],
+        colours=len(PALETTE),
+        config=list(words.flatten(page.config)),
+        nearest=radii[:1],
+        unit=_unit(page.runs),
+    )
+
+
+@cache
+def _template() -> Template:
+    made = Environment(
+        loader=PackageLoader("marlyap", "report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    for name in ("anything", "both", "decimal", "duration", "integer", "interval", "p_value"):
+        made.filters[name] = getattr(words, name)
+    made.filters |= {"percent": words.percent, "text": words.text}
+    made.filters |= {"name": charts.name, "within": _rate_within}
+    made.filters |= {
+        "afterwards": _afterwards,
+        "gauge": _gauge,
+        "verdict": _verdict,
+        "facts": _facts,
+    }
+    made.tests["known"] = lambda value: words.number(value) is not None
+    return made.get_template("page.html")
+
+
+def _own(name: str) -> Markup:
+    """A file of the package, which is trusted."""
+    return Markup(files("marlyap.report").joinpath(name).read_text(encoding="utf-8"))
+
+
+def _policy(script: str) -> str:
+    """A content security policy: nothing from anywhere, and no script but this one."""
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    nothing = "default-src 'none'; base-uri 'none'; form-action 'none'"
+    return f"{nothing}; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
+
+
+def _json(value: Any) -> Markup:
+    """JSON that can stand inside a script element, whatever the strings say."""
+    dense = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return Markup(dense.translate({ord(c): f"\\u{ord(c):04x}" for c in "<>&"}))
+
+
+def _unit(runs: Sequence[Figures]) -> str:
+    """The unit of distances and radii, where all runs share it."""
+    units = {run.unit for run in runs}
+    return units.pop() if len(units) == 1 else ""
+
+
+# ---- pictures ----
+
+
+def _paths(scene: Scene, prefix: str) -> Markup:
+    height = SQUARE[0] * sum(plot.heights(scene))
+    figure = plot.figure(SQUARE[0], height)
+    plot.whole(figure, scene)
+    return Markup(plot.svg(figure, f"trajectories, {scene.label}", prefix))
+
+
+def _chart(chart: charts.Chart, prefix: str) -> Markup:
+    figure = plot.figure(*WIDE)
+    plot.chart(figure.subplots(), chart)
+    return Markup(plot.svg(figure, chart.caption, prefix))
+
+
+def _slice(part: Slice, prefix: str) -> Markup:
+    figure = plot.figure(*SQUARE)
+    plot.level_sets(figure.subplots(), part)
+    return Markup(plot.svg(figure, f"level sets of V, {part.label}", prefix))
+
+
+def _gauge(figures: Figures) -> dict[str, float]:
+    """Where the rate and its interval stand on a line from 0 to 300."""
+    rate = words.number(figures.success_rate) or 0.0
+    low, high = words.pair(figures.interval) or (rate, rate)
+    return {"rate": 300 * rate, "low": 300 * low, "width": 300 * max(high - low, 0.004)}
+
+
+def _afterwards(group: Group) -> str:
+    """What the team does once it has arrived."""
+    share = lambda part: words.percent(None if part is None else part.success_rate)
+    parts = [f"at rest at the last step: {share(group.at_rest)}"] * (group.at_rest is not None)
+    if group.beyond_steps:
+        more = words.integer(group.beyond_steps)
+        parts.append(f"stays for {more} steps more: {share(group.stayed)}")
+    return "; ".join(parts)
+
+
+# ---- tables ----
+
+
+def _rate_within(run: Figures, radius: float) -> float | None:
+    return {r: rate for r, rate, *_ in charts.within(run)}.get(radius)
+
+
+def _share_asked(claim: Claim) -> bool:
+    """Whether a claim is about a share of the starts, and is judged by that share."""
+    asked, bound = words.number(claim.asked), words.number(claim.bound)
+    return asked is not None and bound is not None and claim.holds == (bound >= asked)
+
+
+def _verdict(claim: Claim) -> tuple[str, str]:
+    """A claim's verdict in words, and the class of its mark."""
+    share = _share_asked(claim)
+    if claim.holds:
+        return ("reached" if share else "holds"), "holds"
+    return ("not reached" if share else "does not hold"), "fails"
+
+
+def _facts(claim: Claim) -> list[tuple[str, str]]:
+    """What was asked and what was shown, and how."""
+    facts: dict[str, Any] = {"evidence": claim.evidence}
+    if _share_asked(claim):
+        facts |= {"asked": words.percent(claim.asked)}
+        facts |= {"shown": claim.shown or words.percent(claim.bound)}
+    else:
+        facts |= {"bound": claim.bound}
+    facts |= {"confidence": claim.confidence, "scope": claim.scope}
+    return [(k, words.anything(v)) for k, v in facts.items() if v is not None]
