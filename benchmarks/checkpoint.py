@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from marlyap import MASAC, Lyapunov, Rendezvous, Schedule, Trainer
-from marlyap.fit import PATIENCE, SHARE
-from marlyap.run import Run, begin
+from marlyap.runs.fit import PATIENCE, SHARE
+from marlyap.runs.run import Run, begin
 
 
 def main(argv=None):

@@ -11,7 +11,7 @@ import harness
 import jax
 
 from marlyap import Decentralised, Rendezvous
-from marlyap.rollout import Uniform, rollout
+from marlyap.simulation.rollout import Uniform, rollout
 
 
 def job(game, environments, episodes):

@@ -26,9 +26,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from marlyap.game import AbstractGame
-from marlyap.off_policy import AbstractOffPolicy
-from marlyap.trainer import Schedule, Trainer
+from marlyap.games.game import AbstractGame
+from marlyap.learning.off_policy import AbstractOffPolicy
+from marlyap.learning.trainer import Schedule, Trainer
 
 
 READY = "ready"

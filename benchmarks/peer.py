@@ -21,8 +21,8 @@ import harness
 import jax
 
 from marlyap import MASAC, Lyapunov, Rendezvous, Schedule, Trainer
-from marlyap.algorithms import PRESETS
-from marlyap.cache import cache_directory
+from marlyap.compute.cache import cache_directory
+from marlyap.learning.algorithms import PRESETS
 
 
 PACKAGES = ("torchrl==0.11.1", "vmas==1.5.2", "hydra-core", "omegaconf", "tqdm")

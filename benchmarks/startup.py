@@ -13,7 +13,7 @@ from pathlib import Path
 
 import harness
 
-from marlyap.programs import FOLDER
+from marlyap.compute.export_cache import FOLDER
 
 
 TRAIN = "train rendezvous masac-lyapunov --seeds 0 --steps"

@@ -18,9 +18,9 @@ from collections import Counter
 import harness
 
 from marlyap import MASAC, Lyapunov, Rendezvous
-from marlyap.algorithms import PRESETS
-from marlyap.nets import Shape
-from marlyap.source import shape
+from marlyap.learning.algorithms import PRESETS
+from marlyap.learning.source import shape
+from marlyap.nets.nets import Shape
 
 
 def needed(algorithm: MASAC, s: Shape) -> float:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from marlyap import MASAC, AbstractGame, Schedule, State, Unicycle, evaluate, train
-from marlyap.dynamics import AbstractDynamics
+from marlyap.games.dynamics import AbstractDynamics
 from marlyap.tasks.rendezvous import scatter
 
 

@@ -4,8 +4,9 @@ import argparse
 from itertools import count
 from pathlib import Path
 
-from marlyap import MASAC, Lyapunov, Rendezvous, Run, Schedule, Trainer, launch
-from marlyap.events import Progress
+from marlyap import MASAC, Lyapunov, Rendezvous, Run, Schedule, Trainer
+from marlyap.runs import launch
+from marlyap.runs.events import Progress
 
 
 def main(place: Path, steps: int, **smaller: int):

@@ -32,26 +32,27 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from marlyap import events, statistics
-from marlyap.algorithm import AbstractAlgorithm
+from marlyap import statistics
 from marlyap.certificates.contraction import Contraction
-from marlyap.config import fields
 from marlyap.errors import UserError
-from marlyap.evaluation import Evaluation, evaluate, share
-from marlyap.game import AbstractGame
-from marlyap.identity import policy_hash
-from marlyap.marl_eval import document
-from marlyap.progress import show
-from marlyap.provenance import provenance
+from marlyap.games.game import AbstractGame
+from marlyap.learning.algorithm import AbstractAlgorithm
+from marlyap.learning.trainer import SCHEDULES, Schedule, Trainer
 from marlyap.report.scene import PALETTE
-from marlyap.rollout import rollout
-from marlyap.run import Run
+from marlyap.runs import events
+from marlyap.runs.config import fields
 from marlyap.runs.launch import Launch, launch
+from marlyap.runs.marl_eval import document
+from marlyap.runs.progress import show
+from marlyap.runs.provenance import provenance
+from marlyap.runs.run import Run
 from marlyap.runs.stop import Stop
 from marlyap.seeds import stream
-from marlyap.store import write_text_atomic
+from marlyap.simulation.evaluation import Evaluation, evaluate, share
+from marlyap.simulation.rollout import rollout
+from marlyap.storage.hashing import policy_hash
+from marlyap.storage.store import write_text_atomic
 from marlyap.tasks import TASKS
-from marlyap.trainer import SCHEDULES, Schedule, Trainer
 
 
 Row = dict[str, Any]

@@ -12,11 +12,11 @@ from pathlib import Path
 from common import after
 
 from marlyap.controllers import CONTROLLERS, Cascade, OptimalControl
-from marlyap.dynamics import Unicycle
-from marlyap.evaluation import evaluate, share
-from marlyap.identity import policy_hash
-from marlyap.provenance import provenance
-from marlyap.store import write_text_atomic
+from marlyap.games.dynamics import Unicycle
+from marlyap.runs.provenance import provenance
+from marlyap.simulation.evaluation import evaluate, share
+from marlyap.storage.hashing import policy_hash
+from marlyap.storage.store import write_text_atomic
 from marlyap.tasks.rendezvous import Rendezvous
 
 

@@ -15,8 +15,8 @@ from dataclasses import replace
 
 from common import Case, at_budget, experiment, options, schedule
 
-from marlyap.algorithms import MASAC
-from marlyap.constraints import Lyapunov, Unconstrained
+from marlyap.learning.algorithms import MASAC
+from marlyap.learning.constraints import Lyapunov, Unconstrained
 from marlyap.tasks import TASKS
 
 

@@ -17,8 +17,8 @@ from collections import defaultdict
 
 from common import Case, at_budget, experiment, forest, options, read, schedule
 
-from marlyap.algorithms import ALGORITHMS, MASAC
-from marlyap.constraints import Lyapunov
+from marlyap.learning.algorithms import ALGORITHMS, MASAC
+from marlyap.learning.constraints import Lyapunov
 from marlyap.report.data import LogRow, Trained
 from marlyap.report.png import learning_curves_png
 from marlyap.tasks import TASKS

@@ -10,12 +10,12 @@ from dataclasses import replace
 
 from common import Case, experiment, options, schedule
 
-from marlyap.algorithms import MASAC, paper
+from marlyap.learning.algorithms import MASAC
+from marlyap.learning.trainer import SCHEDULES
 from marlyap.tasks import TASKS
-from marlyap.trainer import SCHEDULES
 
 
-TUNED, PAPER = MASAC(), paper(MASAC())
+TUNED, PAPER = MASAC(), MASAC().paper()
 # Fields of the algorithm, and of the schedule.
 WITHOUT = {
     "tuned": ({}, {}),

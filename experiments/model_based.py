@@ -20,11 +20,11 @@ from common import (
     read,
 )
 
-from marlyap.algorithms import ALGORITHMS
 from marlyap.controllers import CONTROLLERS
-from marlyap.evaluation import evaluate
+from marlyap.learning.algorithms import ALGORITHMS
+from marlyap.learning.trainer import schedule_for
+from marlyap.simulation.evaluation import evaluate
 from marlyap.tasks import TASKS
-from marlyap.trainer import schedule_for
 
 
 COMPARED = ("apg", "apg-lyapunov")

@@ -22,15 +22,15 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from marlyap.certificates.certify import certify, save
+from marlyap.certificates.lyapunov import Approach
 from marlyap.certificates.proof import Proof, extents
-from marlyap.certify import certify, save
-from marlyap.lyapunov_function import Approach
-from marlyap.nets import Actors, Greedy, Shape
-from marlyap.planar import Goals
-from marlyap.provenance import provenance
-from marlyap.rollout import Decentralised
+from marlyap.games.planar import Goals
+from marlyap.nets.nets import Actors, Greedy, Shape
+from marlyap.runs.provenance import provenance
 from marlyap.seeds import stream
-from marlyap.store import write_text_atomic
+from marlyap.simulation.rollout import Decentralised
+from marlyap.storage.store import write_text_atomic
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State
 

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 from common import Case, experiment, options, schedule
 
-from marlyap.algorithms import MASAC
-from marlyap.constraints import Lyapunov
+from marlyap.learning.algorithms import MASAC
+from marlyap.learning.constraints import Lyapunov
 from marlyap.tasks import TASKS
 
 

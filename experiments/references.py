@@ -6,8 +6,8 @@
 
 from common import Case, experiment, options, schedule
 
-from marlyap.algorithms import ALGORITHMS
-from marlyap.off_policy import AbstractOffPolicy
+from marlyap.learning.algorithms import ALGORITHMS
+from marlyap.learning.off_policy import AbstractOffPolicy
 from marlyap.tasks import TASKS
 
 

@@ -27,9 +27,9 @@ from headline import cases
 from marlyap import statistics
 from marlyap.certificates.robustness import moved
 from marlyap.controllers import CONTROLLERS
-from marlyap.identity import policy_hash
-from marlyap.perturb import Perturbed, edge_to_cut, follower_to_lose, traced
-from marlyap.provenance import provenance
+from marlyap.games.perturbed import Perturbed, edge_to_cut, follower_to_lose, traced
+from marlyap.runs.provenance import provenance
+from marlyap.storage.hashing import policy_hash
 from marlyap.tasks import TASKS
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from common import Case, experiment, forest, measured, options, schedule
 
-from marlyap.algorithms import ALGORITHMS
+from marlyap.learning.algorithms import ALGORITHMS
 from marlyap.statistics import iqm, mcnemar
 from marlyap.tasks import TASKS
 

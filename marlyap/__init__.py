@@ -3,57 +3,56 @@
 The names below are imported on first use, so that `import marlyap` costs nothing.
 """
 
-import sys
 from importlib import import_module
 
 
 TYPE_CHECKING = False  # `typing` takes longer to import than all that a command's start needs
 if TYPE_CHECKING:
-    from marlyap.algorithm import AbstractAlgorithm as AbstractAlgorithm
-    from marlyap.algorithms import APG as APG, MASAC as MASAC
-    from marlyap.certificate import AbstractCertificate as AbstractCertificate
-    from marlyap.certify import certify as certify
-    from marlyap.constraint import AbstractConstraint as AbstractConstraint
-    from marlyap.constraints import Lyapunov as Lyapunov, Unconstrained as Unconstrained
+    from marlyap.certificates.certificate import AbstractCertificate as AbstractCertificate
+    from marlyap.certificates.certify import certify as certify
+    from marlyap.certificates.lyapunov import AbstractLyapunov as AbstractLyapunov
     from marlyap.controllers import AbstractController as AbstractController
-    from marlyap.dynamics import (
+    from marlyap.errors import UserError as UserError
+    from marlyap.games.dynamics import (
         AbstractDynamics as AbstractDynamics,
         DoubleIntegrator as DoubleIntegrator,
         LateUnicycle as LateUnicycle,
         SingleIntegrator as SingleIntegrator,
         Unicycle as Unicycle,
     )
-    from marlyap.errors import UserError as UserError
-    from marlyap.evaluation import compare as compare, evaluate as evaluate
-    from marlyap.fit import train as train
-    from marlyap.game import (
+    from marlyap.games.game import (
         AbstractGame as AbstractGame,
         AbstractRegulation as AbstractRegulation,
         Tolerance as Tolerance,
     )
-    from marlyap.lyapunov_function import AbstractLyapunov as AbstractLyapunov
-    from marlyap.off_policy import AbstractOffPolicy as AbstractOffPolicy
-    from marlyap.on_policy import AbstractOnPolicy as AbstractOnPolicy
-    from marlyap.physics import AbstractPlant as AbstractPlant
-    from marlyap.planar import AbstractPlanar as AbstractPlanar, Goals as Goals
-    from marlyap.rollout import Decentralised as Decentralised, rollout as rollout
-    from marlyap.run import Run as Run
+    from marlyap.games.physics import AbstractPlant as AbstractPlant
+    from marlyap.games.planar import AbstractPlanar as AbstractPlanar, Goals as Goals
+    from marlyap.learning.algorithm import AbstractAlgorithm as AbstractAlgorithm
+    from marlyap.learning.algorithms import APG as APG, MASAC as MASAC
+    from marlyap.learning.constraint import AbstractConstraint as AbstractConstraint
+    from marlyap.learning.constraints import Lyapunov as Lyapunov, Unconstrained as Unconstrained
+    from marlyap.learning.off_policy import AbstractOffPolicy as AbstractOffPolicy
+    from marlyap.learning.on_policy import AbstractOnPolicy as AbstractOnPolicy
+    from marlyap.learning.schedule import Schedule as Schedule
+    from marlyap.learning.source import AbstractSource as AbstractSource, Simulated as Simulated
+    from marlyap.learning.trainer import Trainer as Trainer
+    from marlyap.runs.fit import train as train
     from marlyap.runs.launch import Launch as Launch, launch as launch
-    from marlyap.schedule import Schedule as Schedule
-    from marlyap.source import AbstractSource as AbstractSource, Simulated as Simulated
+    from marlyap.runs.run import Run as Run
+    from marlyap.simulation.evaluation import compare as compare, evaluate as evaluate
+    from marlyap.simulation.rollout import Decentralised as Decentralised, rollout as rollout
     from marlyap.tasks import Formation as Formation, Rendezvous as Rendezvous
-    from marlyap.trainer import Trainer as Trainer
     from marlyap.types import State as State
 
 PUBLIC = {
-    "algorithm": ("AbstractAlgorithm",),
-    "algorithms": ("APG", "MASAC"),
-    "certificate": ("AbstractCertificate",),
-    "certify": ("certify",),
-    "constraint": ("AbstractConstraint",),
-    "constraints": ("Lyapunov", "Unconstrained"),
+    "learning.algorithm": ("AbstractAlgorithm",),
+    "learning.algorithms": ("APG", "MASAC"),
+    "certificates.certificate": ("AbstractCertificate",),
+    "certificates.certify": ("certify",),
+    "learning.constraint": ("AbstractConstraint",),
+    "learning.constraints": ("Lyapunov", "Unconstrained"),
     "controllers": ("AbstractController",),
-    "dynamics": (
+    "games.dynamics": (
         "AbstractDynamics",
         "DoubleIntegrator",
         "LateUnicycle",
@@ -61,21 +60,21 @@ PUBLIC = {
         "Unicycle",
     ),
     "errors": ("UserError",),
-    "evaluation": ("compare", "evaluate"),
-    "fit": ("train",),
-    "game": ("AbstractGame", "AbstractRegulation", "Tolerance"),
-    "physics": ("AbstractPlant",),
-    "planar": ("AbstractPlanar", "Goals"),
-    "lyapunov_function": ("AbstractLyapunov",),
-    "off_policy": ("AbstractOffPolicy",),
-    "on_policy": ("AbstractOnPolicy",),
-    "rollout": ("Decentralised", "rollout"),
-    "run": ("Run",),
+    "simulation.evaluation": ("compare", "evaluate"),
+    "runs.fit": ("train",),
+    "games.game": ("AbstractGame", "AbstractRegulation", "Tolerance"),
+    "games.physics": ("AbstractPlant",),
+    "games.planar": ("AbstractPlanar", "Goals"),
+    "certificates.lyapunov": ("AbstractLyapunov",),
+    "learning.off_policy": ("AbstractOffPolicy",),
+    "learning.on_policy": ("AbstractOnPolicy",),
+    "simulation.rollout": ("Decentralised", "rollout"),
+    "runs.run": ("Run",),
     "runs.launch": ("Launch", "launch"),
-    "schedule": ("Schedule",),
-    "source": ("AbstractSource", "Simulated"),
+    "learning.schedule": ("Schedule",),
+    "learning.source": ("AbstractSource", "Simulated"),
     "tasks": ("Formation", "Rendezvous"),
-    "trainer": ("Trainer",),
+    "learning.trainer": ("Trainer",),
     "types": ("State",),
 }
 _HOME = {name: module for module, names in PUBLIC.items() for name in names}
@@ -96,13 +95,3 @@ def __getattr__(name: str) -> object:
 
 def __dir__() -> list[str]:
     return sorted([*__all__, "__version__"])
-
-
-class _Package(type(sys)):
-    def __setattr__(self, name: str, value: object) -> None:
-        """Leave `marlyap.certify` the function when Python has imported the module of that name."""
-        if not (name in _HOME and isinstance(value, type(sys))):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package

@@ -29,22 +29,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from marlyap import store
-from marlyap.certificate import AbstractCertificate, Found, Verdict, judged
 from marlyap.certificates.basin import Basin
+from marlyap.certificates.certificate import AbstractCertificate, Found, Verdict, judged
 from marlyap.certificates.composition import Composition, _Windows, worst_excess
 from marlyap.certificates.contraction import Contraction, rates
 from marlyap.certificates.decrease import Decrease
+from marlyap.certificates.lyapunov import CostSum
 from marlyap.certificates.quantiles import NAMES, Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness
 from marlyap.certificates.safety import Apart, Safe
 from marlyap.certificates.theorem1 import Theorem1, _Tuple
-from marlyap.dynamics import AbstractDynamics, SingleIntegrator
-from marlyap.lyapunov_function import CostSum
-from marlyap.perturb import Perturbed, traced
-from marlyap.planar import AbstractPlanar, Goals
-from marlyap.provenance import provenance
+from marlyap.games.dynamics import AbstractDynamics, SingleIntegrator
+from marlyap.games.perturbed import Perturbed, traced
+from marlyap.games.planar import AbstractPlanar, Goals
+from marlyap.runs.provenance import provenance
 from marlyap.statistics import (
     iqm,
     lower_bound,
@@ -53,6 +52,7 @@ from marlyap.statistics import (
     probability_of_improvement,
     two_level_bootstrap,
 )
+from marlyap.storage import store
 from marlyap.types import State
 
 

@@ -79,22 +79,22 @@ def loaders(place: Path) -> list[Any]:
     """One function of `data` for each kind of input, from sound examples made in `place`."""
     import jax.numpy as jnp
 
-    from marlyap import store
-    from marlyap.algorithms import MASAC
     from marlyap.certificates.basin import Basin
+    from marlyap.certificates.certify import certify, save
     from marlyap.certificates.composition import Composition
     from marlyap.certificates.contraction import Contraction
+    from marlyap.certificates.lyapunov import Quadratic
     from marlyap.certificates.quantiles import Quantiles
     from marlyap.certificates.reach import Reach
     from marlyap.certificates.robustness import Robustness
-    from marlyap.certify import certify, save
-    from marlyap.constraints import Lyapunov
-    from marlyap.fit import fit
-    from marlyap.lyapunov_function import Quadratic
+    from marlyap.learning.algorithms import MASAC
+    from marlyap.learning.constraints import Lyapunov
+    from marlyap.learning.trainer import Schedule, Trainer
     from marlyap.recheck import recheck
-    from marlyap.run import Run
+    from marlyap.runs.fit import fit
+    from marlyap.runs.run import Run
+    from marlyap.storage import store
     from marlyap.tasks import Rendezvous
-    from marlyap.trainer import Schedule, Trainer
 
     small = {"actor_width": 4, "critic_width": 4, "batch": 4}
     game, algorithm = Rendezvous(agents=2, horizon=8), MASAC(**small, constraint=Lyapunov())

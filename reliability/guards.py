@@ -20,7 +20,7 @@ class Guard(NamedTuple):
     test: str
 
 
-STORE, FIT, HEALTH = "marlyap/store.py", "marlyap/fit.py", "marlyap/health.py"
+STORE, FIT, HEALTH = "marlyap/storage/store.py", "marlyap/runs/fit.py", "marlyap/learning/health.py"
 HASH = ('if _sha256([data]) != facts["sha256"]:', "if False:")
 GUARDS = [
     Guard(
@@ -94,7 +94,7 @@ GUARDS = [
     ),
     Guard(
         "12 other config",
-        "marlyap/run.py",
+        "marlyap/runs/run.py",
         (("    store.expect(arrays, dict(zip(names, bits, strict=True)), source)\n", ""),),
         "tests/test_resume.py::test_a_checkpoint_of_another_config_is_refused",
     ),
@@ -200,31 +200,31 @@ GUARDS = [
     ),
     Guard(
         "22 task of the wrong shape",
-        "marlyap/conformance.py",
+        "marlyap/conformance/laws.py",
         (("    if not fits or jnp", "    if jnp"),),
         "tests/test_check_task.py::test_a_broken_task_is_caught_and_its_fault_named[OneCostForAll]",
     ),
     Guard(
         "22 task that is not finite",
-        "marlyap/conformance.py",
+        "marlyap/conformance/laws.py",
         (("            if bad.any():\n", "            if False:\n"),),
         "tests/test_check_task.py::test_a_broken_task_is_caught_and_its_fault_named[RewardIsALogarithm]",
     ),
     Guard(
         "23 action out of range",
-        "marlyap/dynamics.py",
+        "marlyap/games/dynamics.py",
         (("jnp.clip(action, -1.0, 1.0) *", "action *"),),
         "tests/test_dynamics.py::test_actions_are_clipped_and_scaled_by_the_limits",
     ),
     Guard(
         "24 config out of range",
-        "marlyap/game.py",
+        "marlyap/games/game.py",
         (("        if not 0 < self.dt <= 10:\n", "        if False:\n"),),
         "tests/test_every_task.py::test_bad_fields_are_named",
     ),
     Guard(
         "24 typo",
-        "marlyap/config.py",
+        "marlyap/runs/config.py",
         (("    return f\"did you mean '{near[0]}'?\" if near else", "    return"),),
         "tests/test_config.py::test_unknown_names_are_refused_with_a_suggestion",
     ),

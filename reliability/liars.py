@@ -22,32 +22,32 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from marlyap.algorithms.sac import Joint
-from marlyap.certificate import Verdict, sentence
 from marlyap.certificates.basin import Basin
+from marlyap.certificates.certificate import Verdict, sentence
+from marlyap.certificates.certify import certify, save
 from marlyap.certificates.closed_form import ClosedForm
 from marlyap.certificates.composition import Composition
 from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
 from marlyap.certificates.linearisation import Linearisation
+from marlyap.certificates.lyapunov import AbstractLyapunov, Approach
 from marlyap.certificates.proof import Proof
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness
 from marlyap.certificates.safety import Apart, Safe
-from marlyap.certify import certify, save
 from marlyap.conformance import conformance
 from marlyap.controllers.point_offset import PointOffset
 from marlyap.controllers.pursuit import TreePursuit
-from marlyap.dynamics import DoubleIntegrator, SingleIntegrator
 from marlyap.errors import UserError
-from marlyap.evaluation import evaluate
-from marlyap.lyapunov_function import AbstractLyapunov, Approach
-from marlyap.nets import Actors, Greedy
-from marlyap.planar import AbstractPlanar, Goals
+from marlyap.games.dynamics import DoubleIntegrator, SingleIntegrator
+from marlyap.games.planar import AbstractPlanar, Goals
+from marlyap.learning.algorithms.sac import Joint
+from marlyap.learning.source import shape
+from marlyap.nets.nets import Actors, Greedy
 from marlyap.recheck import recheck
-from marlyap.rollout import Decentralised
-from marlyap.source import shape
+from marlyap.simulation.evaluation import evaluate
+from marlyap.simulation.rollout import Decentralised
 from marlyap.tasks import Formation, Rendezvous
 from marlyap.types import State
 

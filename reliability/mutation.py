@@ -22,10 +22,10 @@ from sandbox import changed, run, sandbox
 
 AIMED = {
     "marlyap/statistics.py": ["tests/test_statistics.py"],
-    "marlyap/algorithms/masac.py": ["tests/test_paper.py"],
-    "marlyap/constraints/lyapunov.py": ["tests/test_paper.py"],
-    "marlyap/constraints/readings.py": ["tests/test_paper.py"],
-    "marlyap/on_policy.py": ["tests/test_on_policy.py"],
+    "marlyap/learning/algorithms/masac.py": ["tests/test_paper.py"],
+    "marlyap/learning/constraints/lyapunov.py": ["tests/test_paper.py"],
+    "marlyap/learning/constraints/readings.py": ["tests/test_paper.py"],
+    "marlyap/learning/on_policy.py": ["tests/test_on_policy.py"],
 }
 OTHER = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq,

@@ -23,7 +23,7 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 CHILD = """
 import sys
-import marlyap.fit as f
+import marlyap.runs.fit as f
 f.PATIENCE, f.SHARE = 1.0, 1e9
 from marlyap.cli import main
 sys.exit(main(["train", "--resume", sys.argv[1]]))
@@ -48,13 +48,13 @@ def main() -> int:
     sys.path.insert(0, str(ROOT))
     import numpy as np
 
-    from marlyap.algorithms import MASAC
-    from marlyap.constraints import Lyapunov
-    from marlyap.dynamics import SingleIntegrator
-    from marlyap.fit import advance
-    from marlyap.run import Run, begin, flatten
+    from marlyap.games.dynamics import SingleIntegrator
+    from marlyap.learning.algorithms import MASAC
+    from marlyap.learning.constraints import Lyapunov
+    from marlyap.learning.trainer import Schedule, Trainer
+    from marlyap.runs.fit import advance
+    from marlyap.runs.run import Run, begin, flatten
     from marlyap.tasks import Rendezvous
-    from marlyap.trainer import Schedule, Trainer
 
     game = Rendezvous(agents=2, horizon=4, dynamics=SingleIntegrator())
     algorithm = MASAC(actor_width=4, critic_width=4, batch=4, constraint=Lyapunov())

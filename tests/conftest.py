@@ -131,7 +131,7 @@ def game():
 @pytest.fixture(scope="session")
 def shape():
     """What an algorithm is told of a game; no two sizes are equal."""
-    from marlyap.nets import Shape
+    from marlyap.nets.nets import Shape
 
     return Shape(agents=3, obs=5, features=6, errors=4, du=2)
 
@@ -164,8 +164,8 @@ def batch(shape):
 @pytest.fixture(scope="session")
 def masac():
     """MASAC with tiny nets and a learnt constraint."""
-    from marlyap.algorithms.masac import MASAC
-    from marlyap.constraints.lyapunov import Lyapunov
+    from marlyap.learning.algorithms.masac import MASAC
+    from marlyap.learning.constraints.lyapunov import Lyapunov
 
     constraint = Lyapunov(horizon=3, weight=None)
     return MASAC(
@@ -193,7 +193,7 @@ def learner(masac, shape, batch):
     """Its learner in mid-training: targets lag, norms and temperature have moved; Adam is fresh."""
     import equinox as eqx
 
-    from marlyap.optimiser import TrainState
+    from marlyap.learning.optimiser import TrainState
 
     l = filled(masac.init, shape, jax.random.key(0))
     number = lambda x: jnp.asarray(x, jnp.float32)

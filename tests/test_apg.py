@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap.algorithms import ALGORITHMS, APG
-from marlyap.dynamics import SingleIntegrator, Unicycle
-from marlyap.evaluation import evaluate
-from marlyap.fit import train
-from marlyap.nets import Actors
-from marlyap.optimiser import ADAM
-from marlyap.schedule import Schedule
-from marlyap.source import shape
+from marlyap.games.dynamics import SingleIntegrator, Unicycle
+from marlyap.learning.algorithms import ALGORITHMS, APG
+from marlyap.learning.optimiser import ADAM
+from marlyap.learning.schedule import Schedule
+from marlyap.learning.source import shape
+from marlyap.learning.trainer import Trainer, schedule_for
+from marlyap.nets.nets import Actors
+from marlyap.runs.fit import train
+from marlyap.simulation.evaluation import evaluate
 from marlyap.tasks import Rendezvous
-from marlyap.trainer import Trainer, schedule_for
 
 
 GAME = Rendezvous(agents=2, horizon=6, dynamics=Unicycle())

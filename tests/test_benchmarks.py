@@ -79,7 +79,7 @@ def test_products_of_a_program(benchmarks):
 def test_needed_is_counted_by_hand(benchmarks):
     """The smallest of all updates, written out."""
     from marlyap import MASAC
-    from marlyap.nets import Shape
+    from marlyap.nets.nets import Shape
 
     needed = benchmarks("update")["needed"]
     one = MASAC(batch=1, actor_width=1, critic_width=1, heads="team")

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap.certificate import (
+from marlyap.certificates import CERTIFICATES, bounds, quantiles
+from marlyap.certificates.basin import Basin, largest_level
+from marlyap.certificates.certificate import (
     AbstractCertificate,
     Verdict,
     failures_allowed,
@@ -17,31 +19,29 @@ from marlyap.certificate import (
     sentence,
     start_of,
 )
-from marlyap.certificates import CERTIFICATES, bounds, quantiles
-from marlyap.certificates.basin import Basin, largest_level
+from marlyap.certificates.certify import certify, save
 from marlyap.certificates.closed_form import ClosedForm
 from marlyap.certificates.composition import Composition, fit_row
 from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
 from marlyap.certificates.information import information
 from marlyap.certificates.linearisation import Linearisation
+from marlyap.certificates.lyapunov import Approach, CostSum, Norm, Quadratic, cost_sum
 from marlyap.certificates.proof import Loop, Proof, extents, halves, lyapunov
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness
 from marlyap.certificates.safety import Apart, Safe
 from marlyap.certificates.theorem1 import Theorem1, input_jacobian, l_f
-from marlyap.certify import certify, save
 from marlyap.controllers.point_offset import PointOffset
-from marlyap.dynamics import AbstractDynamics, DoubleIntegrator, SingleIntegrator, Unicycle
 from marlyap.errors import UserError
-from marlyap.identity import policy_hash
-from marlyap.lyapunov_function import Approach, CostSum, Norm, Quadratic, cost_sum
-from marlyap.nets import Actors, Greedy, NormNet, Shape
-from marlyap.perturb import Perturbed
-from marlyap.planar import AbstractPlanar, Goals
-from marlyap.rollout import Decentralised
+from marlyap.games.dynamics import AbstractDynamics, DoubleIntegrator, SingleIntegrator, Unicycle
+from marlyap.games.perturbed import Perturbed
+from marlyap.games.planar import AbstractPlanar, Goals
+from marlyap.nets.nets import Actors, Greedy, NormNet, Shape
+from marlyap.simulation.rollout import Decentralised
 from marlyap.statistics import lower_bound
+from marlyap.storage.hashing import policy_hash
 from marlyap.tasks.formation import Formation
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State

@@ -9,15 +9,15 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from marlyap import store
-from marlyap.algorithms import MASAC
 from marlyap.cli import main
-from marlyap.constraints import Lyapunov
-from marlyap.dynamics import SingleIntegrator
+from marlyap.games.dynamics import SingleIntegrator
+from marlyap.learning.algorithms import MASAC
+from marlyap.learning.constraints import Lyapunov
+from marlyap.learning.trainer import Schedule, Trainer
 from marlyap.report.contents import certificates
-from marlyap.run import Run
+from marlyap.runs.run import Run
+from marlyap.storage import store
 from marlyap.tasks.rendezvous import Rendezvous
-from marlyap.trainer import Schedule, Trainer
 
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from marlyap.cli import main
-from marlyap.conformance import LAWS, Probe, _steepest, conformance, shapes
+from marlyap.conformance.laws import LAWS, Probe, _steepest, conformance, shapes
 from marlyap.controllers import UniformlyRandom
-from marlyap.dynamics import SingleIntegrator
-from marlyap.evaluation import evaluate
+from marlyap.games.dynamics import SingleIntegrator
+from marlyap.simulation.evaluation import evaluate
 from marlyap.tasks import Formation, Rendezvous
 from marlyap.types import State
 
@@ -588,8 +588,8 @@ def test_a_task_that_raises_when_it_runs_is_told_so():
 
 FILE = """
 import jax.numpy as jnp
-from marlyap.dynamics import SingleIntegrator
-from marlyap.evaluation import evaluate
+from marlyap.games.dynamics import SingleIntegrator
+from marlyap.simulation.evaluation import evaluate
 from marlyap.tasks import Formation, Rendezvous
 
 class Mine(Rendezvous):

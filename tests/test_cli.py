@@ -16,14 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap import config, store
 from marlyap.cli import main
 from marlyap.cli.parser import VERBS as TABLE
-from marlyap.game import AbstractGame
-from marlyap.run import Run
+from marlyap.games.game import AbstractGame
+from marlyap.runs import config
+from marlyap.runs.run import Run
+from marlyap.storage import store
 
 
-FIT = importlib.import_module("marlyap.fit")  # `marlyap.fit` may also be the function
+FIT = importlib.import_module("marlyap.runs.fit")
 TINY = """--task.agents 2 --task.horizon 4 --task.dynamics single-integrator --steps 48
 --schedule.environments 2 --schedule.steps_per_update 4 --schedule.warmup 8 --schedule.capacity 40
 --schedule.judge_every 4 --schedule.judge_episodes 4
@@ -602,7 +603,7 @@ def test_list_shows_whole_sentences(capsys):
 
 LAW = """
 from marlyap.controllers import Zero
-from marlyap.game import AbstractGame
+from marlyap.games.game import AbstractGame
 
 class Push(Zero):
     game: AbstractGame

@@ -7,17 +7,17 @@ import pytest
 from conftest import put_anywhere
 from hypothesis import given, settings, strategies as st
 
-from marlyap import config
-from marlyap.algorithm import AbstractAlgorithm
-from marlyap.algorithms import ALGORITHMS, MASAC, PRESETS, DecentralisedSAC
-from marlyap.constraint import Unconstrained
-from marlyap.constraints import CONSTRAINTS, Lyapunov
-from marlyap.dynamics import DYNAMICS, DoubleIntegrator, Unicycle
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
-from marlyap.run import Run
+from marlyap.games.dynamics import DYNAMICS, DoubleIntegrator, Unicycle
+from marlyap.games.game import AbstractGame
+from marlyap.learning.algorithm import AbstractAlgorithm
+from marlyap.learning.algorithms import ALGORITHMS, MASAC, PRESETS, DecentralisedSAC
+from marlyap.learning.constraint import Unconstrained
+from marlyap.learning.constraints import CONSTRAINTS, Lyapunov
+from marlyap.learning.trainer import SCHEDULES, Schedule, Trainer
+from marlyap.runs import config
+from marlyap.runs.run import Run
 from marlyap.tasks import TASKS, Rendezvous
-from marlyap.trainer import SCHEDULES, Schedule, Trainer
 
 
 GAME, RULE, ALONE = Rendezvous(), MASAC(constraint=Lyapunov()), DecentralisedSAC()
@@ -381,7 +381,7 @@ def test_describe_names_every_field_that_can_be_set():
 
 OWN = '''
 import jax.numpy as jnp
-from marlyap.algorithms import MASAC
+from marlyap.learning.algorithms import MASAC
 from marlyap.tasks import Rendezvous
 
 class Meeting(Rendezvous):
@@ -496,7 +496,7 @@ def write(tmp_path, text):
 def test_a_class_that_cannot_be_made_without_arguments(tmp_path):
     name = write(
         tmp_path,
-        "from marlyap.game import AbstractGame\nclass Mine(AbstractGame):\n    agents: int\n",
+        "from marlyap.games.game import AbstractGame\nclass Mine(AbstractGame):\n    agents: int\n",
     )
     refused(lambda: config.load(name, AbstractGame), "Mine")
 

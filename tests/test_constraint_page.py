@@ -10,10 +10,10 @@ import pytest
 from conftest import filled
 from test_docs import blocks
 
-from marlyap import config
-from marlyap.constraints import Lyapunov
-from marlyap.constraints.readings import READINGS
-from marlyap.nets import Sample
+from marlyap.learning.constraints import Lyapunov
+from marlyap.learning.constraints.readings import READINGS
+from marlyap.nets.nets import Sample
+from marlyap.runs import config
 
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")

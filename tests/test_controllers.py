@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap.config import load_controller
 from marlyap.controllers import (
     CONTROLLERS,
     AbstractController,
@@ -15,11 +14,12 @@ from marlyap.controllers import (
     Replayed,
     names_a_controller,
 )
-from marlyap.dynamics import DoubleIntegrator, LateUnicycle, Unicycle
 from marlyap.errors import UserError
-from marlyap.evaluation import evaluate
-from marlyap.planar import Goals
-from marlyap.rollout import rollout
+from marlyap.games.dynamics import DoubleIntegrator, LateUnicycle, Unicycle
+from marlyap.games.planar import Goals
+from marlyap.runs.config import load_controller
+from marlyap.simulation.evaluation import evaluate
+from marlyap.simulation.rollout import rollout
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State
 
@@ -173,7 +173,7 @@ def test_lin_francis_maggiore_approaches_slowly():
 
 OWN = """
 from marlyap.controllers import AbstractController, TreePursuit
-from marlyap.planar import AbstractPlanar, Goals
+from marlyap.games.planar import AbstractPlanar, Goals
 
 class PD(AbstractController):
     game: AbstractPlanar

@@ -12,9 +12,10 @@ from pathlib import Path
 import jax, numpy as np
 from jax.sharding import PartitionSpec as P
 from conftest import keep_compiled_code
-from marlyap import MASAC, Rendezvous, Schedule, Trainer, devices
-from marlyap.fit import fit
-from marlyap.run import Run, flatten
+from marlyap import MASAC, Rendezvous, Schedule, Trainer
+from marlyap.compute import devices
+from marlyap.runs.fit import fit
+from marlyap.runs.run import Run, flatten
 
 keep_compiled_code()
 jax.config.update("jax_disable_most_optimizations", True)

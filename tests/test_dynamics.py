@@ -10,9 +10,15 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from marlyap.certificates.theorem1 import l_f
-from marlyap.constraints.lyapunov import Lyapunov
-from marlyap.dynamics import DYNAMICS, DoubleIntegrator, LateUnicycle, SingleIntegrator, Unicycle
 from marlyap.errors import UserError
+from marlyap.games.dynamics import (
+    DYNAMICS,
+    DoubleIntegrator,
+    LateUnicycle,
+    SingleIntegrator,
+    Unicycle,
+)
+from marlyap.learning.constraints.lyapunov import Lyapunov
 
 
 def unicycle(x, u):

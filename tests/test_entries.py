@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from marlyap.dynamics import DYNAMICS
-from marlyap.perturb import Perturbed
+from marlyap.games.dynamics import DYNAMICS
+from marlyap.games.perturbed import Perturbed
 from marlyap.tasks import TASKS, Formation, Rendezvous
 
 

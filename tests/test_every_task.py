@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap.conformance import LAWS, conformance, see
-from marlyap.dynamics import DoubleIntegrator, LateUnicycle, SingleIntegrator, Unicycle
+from marlyap.conformance.laws import LAWS, conformance, see
 from marlyap.errors import UserError
-from marlyap.rollout import Decentralised, Uniform, rollout
-from marlyap.sensing import near
+from marlyap.games.dynamics import DoubleIntegrator, LateUnicycle, SingleIntegrator, Unicycle
+from marlyap.games.sensing import near
+from marlyap.simulation.rollout import Decentralised, Uniform, rollout
 from marlyap.tasks import TASKS
 from marlyap.tasks.rendezvous import Rendezvous
 

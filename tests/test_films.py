@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap.game import AbstractGame
-from marlyap.physics import AbstractPlant
+from marlyap.games.game import AbstractGame
+from marlyap.games.physics import AbstractPlant
 from marlyap.report.data import Page
 from marlyap.report.episodes import film
 from marlyap.report.page import html
-from marlyap.rollout import rollout
+from marlyap.simulation.rollout import rollout
 from marlyap.types import Entry, Scene, State
 
 

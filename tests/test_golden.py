@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap.game import AbstractRegulation
-from marlyap.planar import Goals
+from marlyap.games.game import AbstractRegulation
+from marlyap.games.planar import Goals
 from marlyap.tasks import TASKS
 from marlyap.types import State
 

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marlyap import groups
-from marlyap.algorithms import ALGORITHMS, MASAC
-from marlyap.constraints import Lyapunov
-from marlyap.evaluation import Evaluation
-from marlyap.run import Run
+from marlyap.learning.algorithms import ALGORITHMS, MASAC
+from marlyap.learning.constraints import Lyapunov
+from marlyap.learning.trainer import Schedule, Trainer
+from marlyap.runs import groups
+from marlyap.runs.run import Run
+from marlyap.simulation.evaluation import Evaluation
 from marlyap.statistics import clopper_pearson, mean_interval
 from marlyap.tasks import TASKS, Rendezvous
-from marlyap.trainer import Schedule, Trainer
 
 
 NAMES = {"task": "rendezvous", "algorithm": "masac-lyapunov", "preset": "tuned"}

@@ -10,14 +10,14 @@ import pytest
 from conftest import close, filled
 from test_paper import mlp, rows, xs
 
-from marlyap import optimiser
-from marlyap.algorithms.masac import MASAC
-from marlyap.constraints.lyapunov import Lyapunov
 from marlyap.errors import UserError
-from marlyap.nets import Actors, MeanFieldCritic
-from marlyap.run import Run
+from marlyap.learning import optimiser
+from marlyap.learning.algorithms.masac import MASAC
+from marlyap.learning.constraints.lyapunov import Lyapunov
+from marlyap.learning.trainer import Schedule, Trainer
+from marlyap.nets.nets import Actors, MeanFieldCritic
+from marlyap.runs.run import Run
 from marlyap.tasks.rendezvous import Rendezvous
-from marlyap.trainer import Schedule, Trainer
 
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")

@@ -5,12 +5,12 @@ import json
 
 import pytest
 
-from marlyap.algorithms import MASAC
 from marlyap.errors import UserError
-from marlyap.marl_eval import document, from_runs
-from marlyap.run import Run
+from marlyap.learning.algorithms import MASAC
+from marlyap.learning.trainer import Schedule, Trainer
+from marlyap.runs.marl_eval import document, from_runs
+from marlyap.runs.run import Run
 from marlyap.tasks import Rendezvous
-from marlyap.trainer import Schedule, Trainer
 
 
 def looks(seed, *values, **others):

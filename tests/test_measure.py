@@ -10,22 +10,22 @@ import jax
 import numpy as np
 import pytest
 
-from marlyap import store
-from marlyap.algorithms import MASAC
+from marlyap.certificates.certify import certify, save
 from marlyap.certificates.reach import Reach
-from marlyap.certify import certify, save
 from marlyap.cli import main
-from marlyap.constraints import Lyapunov
-from marlyap.dynamics import SingleIntegrator
 from marlyap.errors import UserError
+from marlyap.games.dynamics import SingleIntegrator
+from marlyap.learning.algorithms import MASAC
+from marlyap.learning.constraints import Lyapunov
+from marlyap.learning.schedule import Schedule
+from marlyap.learning.source import shape
+from marlyap.learning.trainer import Trainer
 from marlyap.report.data import Film, Frames, LogRow, Trained
 from marlyap.report.gif import film_gif, film_pair_gif
 from marlyap.report.png import learning_curves_png, trajectories_png
-from marlyap.run import Run, flatten
-from marlyap.schedule import Schedule
-from marlyap.source import shape
+from marlyap.runs.run import Run, flatten
+from marlyap.storage import store
 from marlyap.tasks import Rendezvous
-from marlyap.trainer import Trainer
 
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")

@@ -13,14 +13,14 @@ from jaxtyping import Array
 from test_docs import blocks
 from test_toy_games import CONSTANT, REACH, Toy
 
-from marlyap.algorithm import KeyPair
-from marlyap.algorithms import MASAC
-from marlyap.evaluation import outcomes
-from marlyap.on_policy import AbstractOnPolicy, advantages
-from marlyap.rollout import Decentralised, Uniform
-from marlyap.schedule import Schedule
-from marlyap.source import CostWindow
-from marlyap.trainer import Trainer
+from marlyap.learning.algorithm import KeyPair
+from marlyap.learning.algorithms import MASAC
+from marlyap.learning.on_policy import AbstractOnPolicy, advantages
+from marlyap.learning.schedule import Schedule
+from marlyap.learning.source import CostWindow
+from marlyap.learning.trainer import Trainer
+from marlyap.simulation.evaluation import outcomes
+from marlyap.simulation.rollout import Decentralised, Uniform
 
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")

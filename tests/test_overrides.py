@@ -12,30 +12,30 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap.algorithms import MASAC
 from marlyap.certificates.basin import Basin
+from marlyap.certificates.certify import certify, save
 from marlyap.certificates.closed_form import ClosedForm
 from marlyap.certificates.composition import _Windows
 from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
 from marlyap.certificates.linearisation import Linearisation
+from marlyap.certificates.lyapunov import AbstractLyapunov, CostSum
 from marlyap.certificates.proof import Proof
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.safety import Apart, Safe
-from marlyap.certify import certify, save
-from marlyap.dynamics import SingleIntegrator
 from marlyap.errors import UserError
-from marlyap.evaluation import evaluate, outcomes
-from marlyap.lyapunov_function import AbstractLyapunov, CostSum
-from marlyap.perturb import Perturbed
-from marlyap.planar import AbstractPlanar, Goals
+from marlyap.games.dynamics import SingleIntegrator
+from marlyap.games.perturbed import Perturbed
+from marlyap.games.planar import AbstractPlanar, Goals
+from marlyap.learning.algorithms import MASAC
+from marlyap.learning.trainer import Schedule, Trainer
 from marlyap.recheck import recheck
 from marlyap.report.episodes import film
-from marlyap.rollout import Decentralised, rollout
 from marlyap.seeds import stream
+from marlyap.simulation.evaluation import evaluate, outcomes
+from marlyap.simulation.rollout import Decentralised, rollout
 from marlyap.tasks import Rendezvous
-from marlyap.trainer import Schedule, Trainer
 from marlyap.types import State
 
 

@@ -8,10 +8,10 @@ import sys
 
 import pytest
 
-from marlyap import store
 from marlyap.cli import main
 from marlyap.errors import UserError, explained
-from marlyap.run import Run
+from marlyap.runs.run import Run
+from marlyap.storage import store
 
 
 TINY = """--task.horizon 4 --steps 16 --schedule.environments 2 --schedule.steps_per_update 4
@@ -276,9 +276,9 @@ def test_help_has_examples_that_can_be_parsed():
     """Every example is a command that the parser takes and whose names are there."""
     import shlex
 
-    from marlyap.algorithms import ALGORITHMS
     from marlyap.cli.parser import VERBS, parse
     from marlyap.controllers import CONTROLLERS
+    from marlyap.learning.algorithms import ALGORITHMS
     from marlyap.tasks import TASKS
 
     known = {*TASKS, *ALGORITHMS, *CONTROLLERS}

@@ -15,16 +15,16 @@ import pytest
 from conftest import close, filled, level, same
 from scipy import stats
 
-from marlyap.algorithms import MASAC
-from marlyap.constraint import Unconstrained
-from marlyap.constraints.lyapunov import LearnedLyapunov, Lyapunov
-from marlyap.constraints.readings import distance
 from marlyap.errors import UserError
-from marlyap.nets import MLP, Actors, Critic, Greedy, LyapunovNet, NormNet, Sampled, Shape
-from marlyap.optimiser import TrainState, polyak
-from marlyap.rollout import Decentralised, cost_to_go, rollout
+from marlyap.learning.algorithms import MASAC
+from marlyap.learning.constraint import Unconstrained
+from marlyap.learning.constraints.lyapunov import LearnedLyapunov, Lyapunov
+from marlyap.learning.constraints.readings import distance
+from marlyap.learning.optimiser import TrainState, polyak
+from marlyap.learning.trainer import Schedule, Trainer
+from marlyap.nets.nets import MLP, Actors, Critic, Greedy, LyapunovNet, NormNet, Sampled, Shape
+from marlyap.simulation.rollout import Decentralised, cost_to_go, rollout
 from marlyap.tasks import TASKS
-from marlyap.trainer import Schedule, Trainer
 
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 import marlyap
-from marlyap import programs, provenance
-from marlyap.optimiser import TrainState
-from marlyap.store import MANIFEST, PAYLOAD
+from marlyap.compute import export_cache
+from marlyap.learning.optimiser import TrainState
+from marlyap.runs import provenance
+from marlyap.storage.store import MANIFEST, PAYLOAD
 from marlyap.tasks import TASKS
 
 
@@ -35,7 +36,7 @@ def remember(game, carry):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     TRACES.clear()
-    monkeypatch.setenv(programs.FOLDER, str(tmp_path / "programs"))
+    monkeypatch.setenv(export_cache.FOLDER, str(tmp_path / "programs"))
     return tmp_path / "programs"
 
 
@@ -46,7 +47,7 @@ def start(shape=(3,), name="started"):
 
 def compiled(game=GAME, memory=start, f=remember, **more):
     memory = memory()
-    return programs.compiled(f, game, memory, lambda: memory, **more)
+    return export_cache.compiled(f, game, memory, lambda: memory, **more)
 
 
 def same(a, b):
@@ -60,7 +61,7 @@ def test_a_second_start_traces_nothing_and_computes_the_same(folder, monkeypatch
     assert len(TRACES) == 1 and len(list(folder.iterdir())) == 1
     again, cost_again = compiled()(start())
     assert len(TRACES) == 1
-    monkeypatch.setenv(programs.FOLDER, "")
+    monkeypatch.setenv(export_cache.FOLDER, "")
     plain, cost_plain = compiled()(start())
     assert len(TRACES) == 2
     assert same((first, cost), (again, cost_again)) and same((first, cost), (plain, cost_plain))
@@ -100,7 +101,7 @@ def test_another_program_is_traced(change, folder):
 def copied(tmp_path):
     """A copy of the package's source."""
     return shutil.copytree(
-        programs.SOURCE, tmp_path / "marlyap", ignore=shutil.ignore_patterns("__pycache__")
+        export_cache.SOURCE, tmp_path / "marlyap", ignore=shutil.ignore_patterns("__pycache__")
     )
 
 
@@ -110,28 +111,28 @@ def change(path):
 
 def test_a_change_in_any_file_of_the_package_is_noticed(monkeypatch, tmp_path):
     package = Path(marlyap.__file__).parent
-    assert programs.SOURCE == provenance.SOURCE == package
-    monkeypatch.setattr(programs, "SOURCE", copied(tmp_path))
+    assert export_cache.SOURCE == provenance.SOURCE == package
+    monkeypatch.setattr(export_cache, "SOURCE", copied(tmp_path))
     digests, files = set(), [p for p in package.rglob("*.py") if "__pycache__" not in p.parts]
     try:
         for path in files:
-            change(programs.SOURCE / path.relative_to(package))
-            programs._surroundings.cache_clear()
-            digests.add(programs._surroundings()[0])
+            change(export_cache.SOURCE / path.relative_to(package))
+            export_cache._surroundings.cache_clear()
+            digests.add(export_cache._surroundings()[0])
     finally:
-        programs._surroundings.cache_clear()
+        export_cache._surroundings.cache_clear()
     assert len(digests) == len(files)
 
 
 @pytest.mark.parametrize("what", ["source", "version", "setting", "device"])
 def test_what_surrounds_a_program_belongs_to_its_name(what, folder, monkeypatch, tmp_path):
     compiled()
-    programs._surroundings.cache_clear()
+    export_cache._surroundings.cache_clear()
     if what == "source":
-        monkeypatch.setattr(programs, "SOURCE", copied(tmp_path))
-        change(next(programs.SOURCE.rglob("nets.py")))
+        monkeypatch.setattr(export_cache, "SOURCE", copied(tmp_path))
+        change(next(export_cache.SOURCE.rglob("nets.py")))
     elif what == "version":
-        monkeypatch.setattr(programs.store, "versions", lambda: {"jax": "0"})
+        monkeypatch.setattr(export_cache.store, "versions", lambda: {"jax": "0"})
     elif what == "device":
         device = SimpleNamespace(platform="abacus", device_kind="beads")
         monkeypatch.setattr(jax, "devices", lambda: [device])
@@ -139,7 +140,7 @@ def test_what_surrounds_a_program_belongs_to_its_name(what, folder, monkeypatch,
         with jax.numpy_dtype_promotion("strict" if what == "setting" else "standard"):
             compiled()
     finally:
-        programs._surroundings.cache_clear()
+        export_cache._surroundings.cache_clear()
     assert len(TRACES) == 2 and len(list(folder.iterdir())) == 2
 
 
@@ -167,7 +168,9 @@ def test_a_damaged_program_is_made_anew(part, folder):
     mended, _ = compiled()(start())
     assert len(TRACES) == 2 and same(sound, mended)
     compiled()
-    assert len(TRACES) == 2 and json.loads((place / MANIFEST).read_text())["kind"] == programs.KIND
+    assert (
+        len(TRACES) == 2 and json.loads((place / MANIFEST).read_text())["kind"] == export_cache.KIND
+    )
 
 
 def test_where_nothing_can_be_kept_it_works_all_the_same(folder):
@@ -177,7 +180,7 @@ def test_where_nothing_can_be_kept_it_works_all_the_same(folder):
 
 
 def test_those_used_last_are_kept(folder, monkeypatch):
-    monkeypatch.setattr(programs, "MOST", 2)
+    monkeypatch.setattr(export_cache, "MOST", 2)
     games = [replace(GAME, size=size) for size in (1.0, 2.0, 3.0)]
     for k in (0, 1, 0, 2):  # 1 is the one not used for longest when 2 comes
         compiled(game=games[k])

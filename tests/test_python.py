@@ -8,8 +8,9 @@ import jax
 import pytest
 
 import marlyap
-from marlyap import MASAC, Rendezvous, Run, Schedule, UserError, cache, evaluate, train
+from marlyap import MASAC, Rendezvous, Run, Schedule, UserError, evaluate, train
 from marlyap.cli import main
+from marlyap.compute import cache
 
 
 SCHEDULE = Schedule(
@@ -33,8 +34,8 @@ def test_names_are_shown_and_no_others():
 
 
 def test_a_function_is_not_hidden_by_the_module_of_its_name():
-    script = "import marlyap.rollout, marlyap.certify, marlyap; "
-    script += "from marlyap.rollout import until; from marlyap import certify, rollout; "
+    script = "import marlyap.simulation.rollout, marlyap.certificates.certify, marlyap; "
+    script += "from marlyap.simulation.rollout import until; from marlyap import certify, rollout; "
     script += "print(callable(certify), callable(rollout), callable(marlyap.rollout))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.stdout == "True True True\n", done.stderr
@@ -83,7 +84,7 @@ def test_what_was_trained_is_saved_as_a_run(trained, tmp_path, capsys):
 def test_training_takes_names(monkeypatch):
     import importlib
 
-    fit = importlib.import_module("marlyap.fit")
+    fit = importlib.import_module("marlyap.runs.fit")
     seen = []
 
     class Enough(Exception):
@@ -113,7 +114,7 @@ def test_the_users_own_cache_stays(monkeypatch, tmp_path):
 
 def test_a_second_start_finds_what_the_first_compiled(tmp_path):
     """In Python as on the command line: programs are kept, without a word being set."""
-    script = "import marlyap, jax; from marlyap.cache import enable_cache; "
+    script = "import marlyap, jax; from marlyap.compute.cache import enable_cache; "
     script += "print(enable_cache(True), jax.config.jax_compilation_cache_dir)"
     env = {"XDG_CACHE_HOME": str(tmp_path), "PATH": "/usr/bin:/bin"}
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=env)

@@ -15,32 +15,33 @@ import numpy as np
 import pytest
 
 import marlyap.recheck
-from marlyap import graph as graphs, store
-from marlyap.certificate import Found, start_of, worst_of
+from marlyap import graph as graphs
 from marlyap.certificates.basin import Basin
+from marlyap.certificates.certificate import Found, start_of, worst_of
+from marlyap.certificates.certify import certify, save
 from marlyap.certificates.composition import Composition
 from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
 from marlyap.certificates.linearisation import Linearisation
+from marlyap.certificates.lyapunov import Norm, Quadratic
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness, moved
 from marlyap.certificates.safety import Apart, Safe
 from marlyap.certificates.theorem1 import Theorem1
-from marlyap.certify import certify, save
 from marlyap.cli import main
-from marlyap.dynamics import DoubleIntegrator, LateUnicycle, SingleIntegrator, Unicycle
 from marlyap.errors import UserError
-from marlyap.identity import named_arrays, plain, policy_hash, without_arrays, words
-from marlyap.lyapunov_function import Norm, Quadratic
-from marlyap.nets import Actors, Greedy, NormNet, Shape
-from marlyap.perturb import Perturbed, traced
+from marlyap.games.dynamics import DoubleIntegrator, LateUnicycle, SingleIntegrator, Unicycle
+from marlyap.games.perturbed import Perturbed, traced
+from marlyap.nets.nets import Actors, Greedy, NormNet, Shape
 from marlyap.recheck import Rejected, reader, recheck
 from marlyap.recheck.bounds import lower, needed, order
 from marlyap.recheck.checks import swept
 from marlyap.recheck.world import World, adjacency, hops, places
-from marlyap.rollout import Decentralised, rollout
+from marlyap.simulation.rollout import Decentralised, rollout
 from marlyap.statistics import lower_bound, quantile_upper_bound, trials_needed
+from marlyap.storage import store
+from marlyap.storage.hashing import named_arrays, plain, policy_hash, without_arrays, words
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.threefry import fold, normal, uniform, uniform64
 

@@ -10,18 +10,25 @@ import pytest
 from conftest import filled, same, shrunk
 from scipy import stats
 
-from marlyap import store
-from marlyap.algorithms import ALGORITHMS, MADDPG, MASAC, PRESETS, CentralisedSAC, DecentralisedSAC
-from marlyap.algorithms.sac import alone, joint
-from marlyap.constraints import Lyapunov
 from marlyap.errors import UserError
-from marlyap.nets import Actors, Noisy, Sample
-from marlyap.optimiser import TrainState
-from marlyap.run import Run, flatten
-from marlyap.schedule import Schedule
-from marlyap.source import shape as nets_shape
+from marlyap.learning.algorithms import (
+    ALGORITHMS,
+    MADDPG,
+    MASAC,
+    PRESETS,
+    CentralisedSAC,
+    DecentralisedSAC,
+)
+from marlyap.learning.algorithms.sac import alone, joint
+from marlyap.learning.constraints import Lyapunov
+from marlyap.learning.optimiser import TrainState
+from marlyap.learning.schedule import Schedule
+from marlyap.learning.source import shape as nets_shape
+from marlyap.learning.trainer import Trainer
+from marlyap.nets.nets import Actors, Noisy, Sample
+from marlyap.runs.run import Run, flatten
+from marlyap.storage import store
 from marlyap.tasks.rendezvous import Rendezvous
-from marlyap.trainer import Trainer
 
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from marlyap.replay import Episode, Replay
-from marlyap.rollout import cost_to_go
+from marlyap.learning.replay import Episode, Replay
+from marlyap.simulation.rollout import cost_to_go
 
 
 TIME, AGENTS, GAMMA = 5, 2, 0.9

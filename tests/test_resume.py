@@ -22,24 +22,25 @@ import numpy as np
 import pytest
 from conftest import shrunk
 
-from marlyap import config, events, programs, store
-from marlyap.algorithms import ALGORITHMS, MASAC
 from marlyap.cli import main
-from marlyap.constraints import Lyapunov
-from marlyap.dynamics import SingleIntegrator
+from marlyap.compute import export_cache
 from marlyap.errors import UserError
-from marlyap.fit import Diverged, advance, fit as fit_runs
-from marlyap.game import AbstractGame
-from marlyap.health import Health
-from marlyap.rollout import first_fault
-from marlyap.run import Run, begin, flatten
-from marlyap.runs import launch as launching
+from marlyap.games.dynamics import SingleIntegrator
+from marlyap.games.game import AbstractGame
+from marlyap.learning.algorithms import ALGORITHMS, MASAC
+from marlyap.learning.constraints import Lyapunov
+from marlyap.learning.health import Health
+from marlyap.learning.trainer import Schedule, Trainer
+from marlyap.runs import config, events, launch as launching
+from marlyap.runs.fit import Diverged, advance, fit as fit_runs
 from marlyap.runs.job import Job, Launch
+from marlyap.runs.run import Run, begin, flatten
+from marlyap.simulation.rollout import first_fault
+from marlyap.storage import store
 from marlyap.tasks import Rendezvous
-from marlyap.trainer import Schedule, Trainer
 
 
-FIT = importlib.import_module("marlyap.fit")
+FIT = importlib.import_module("marlyap.runs.fit")
 NAMES = {"task": "rendezvous", "algorithm": "tiny", "preset": "tuned"}
 GAME = Rendezvous(agents=2, horizon=4, dynamics=SingleIntegrator())
 SCHEDULE = Schedule(
@@ -190,7 +191,7 @@ def test_each_algorithm_and_each_reading_resumes_bit_for_bit(
             patched.setattr(Trainer, part, counted(part))
         whole = uninterrupted(name, SINGLE)
     assert traces == {"begin": 1, "iterate": 1, "judge": 1}
-    monkeypatch.setenv(programs.FOLDER, str(tmp_path / "programs"))
+    monkeypatch.setenv(export_cache.FOLDER, str(tmp_path / "programs"))
     (run,) = runs_in(tmp_path, name, SINGLE)
     list(fit([run], until(5)))
     assert run.checkpoints.latest().step == 5
@@ -479,7 +480,7 @@ def test_the_first_fault_of_an_episode():
 
 
 LOUD = """
-from marlyap.dynamics import SingleIntegrator
+from marlyap.games.dynamics import SingleIntegrator
 from marlyap.tasks import Rendezvous
 
 class Loud(Rendezvous):
@@ -523,7 +524,7 @@ def test_a_process_that_is_killed_is_told_with_its_last_words(tmp_path, monkeypa
 
 WAITS = """
 import sys
-from marlyap import events
+from marlyap.runs import events
 from marlyap.runs.job import Job
 job = Job.from_json(sys.stdin.readline())
 for line in sys.stdin:
@@ -645,7 +646,7 @@ def test_a_pair_is_refused_when_one_of_them_is_in_use(tmp_path):
 ENDLESS = dataclasses.replace(SCHEDULE, steps=10**9, judge_every=10**9)
 EAGER = """
 import sys
-import marlyap.fit as f
+import marlyap.runs.fit as f
 f.PATIENCE, f.SHARE = 0.0, 1e9
 from marlyap.cli import main
 sys.exit(main(sys.argv[1:]))

@@ -22,9 +22,9 @@ import safetensors.numpy
 from conftest import put_anywhere
 from hypothesis import HealthCheck, given, settings, strategies as st
 
-from marlyap import store
 from marlyap.errors import UserError
-from marlyap.store import MANIFEST, PAYLOAD, Checkpoints, CorruptError
+from marlyap.storage import store
+from marlyap.storage.store import MANIFEST, PAYLOAD, Checkpoints, CorruptError
 
 
 KILLS = int(os.environ.get("MARLYAP_KILLS", "15"))
@@ -747,7 +747,7 @@ def test_a_replacement_cut_in_two_may_be_damaged_as_well(stored):
 HOLDER = """
 import sys, time
 from pathlib import Path
-from marlyap import store
+from marlyap.storage import store
 with store.lock(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)
@@ -861,7 +861,7 @@ FULL = """
 import resource, sys
 from pathlib import Path
 import numpy as np
-from marlyap import store
+from marlyap.storage import store
 from marlyap.errors import UserError
 checkpoints = store.Checkpoints(Path(sys.argv[1]))
 checkpoints.save(1, {"x": np.ones(1000)}, {})
@@ -892,7 +892,7 @@ def test_a_full_disk_costs_nothing_that_was_there(tmp_path):
 FORBIDDEN = """
 import os, sys
 from pathlib import Path
-from marlyap import store
+from marlyap.storage import store
 from marlyap.errors import UserError
 store.versions()  # what it imports may be in a home that nobody else can read
 if os.getuid() == 0:
@@ -946,7 +946,7 @@ KILLED = """
 import os, random, signal, sys, time
 from pathlib import Path
 import numpy as np
-from marlyap import store
+from marlyap.storage import store
 
 root, trials = Path(sys.argv[1]), int(sys.argv[2])
 checkpoints = store.Checkpoints(root / "c")
@@ -1022,7 +1022,7 @@ CRASHED = """
 import os, shutil, sys
 from pathlib import Path
 import numpy as np
-from marlyap import store
+from marlyap.storage import store
 
 EVENTS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.truncate", "os.listdir"}
 root = Path(sys.argv[1])
@@ -1226,7 +1226,8 @@ def test_a_bad_line_in_the_middle_is_named(tmp_path):
 
 
 def test_it_needs_neither_jax_nor_anything_that_executes_data():
-    script = "import sys, marlyap.store; print({'jax', 'equinox', 'safetensors'} & {*sys.modules})"
+    script = "import sys, marlyap.storage.store; "
+    script += "print({'jax', 'equinox', 'safetensors'} & {*sys.modules})"
     assert python(script).stdout == "set()\n"
     tree = ast.parse(Path(store.__file__).read_text())
     words = {getattr(node, name, "") for node in ast.walk(tree) for name in ("id", "attr", "arg")}

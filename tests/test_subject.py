@@ -5,13 +5,13 @@ import shutil
 
 import pytest
 
-from marlyap import config
-from marlyap.algorithm import AbstractAlgorithm
 from marlyap.cli import main
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
-from marlyap.run import Run
-from marlyap.subject import subject
+from marlyap.games.game import AbstractGame
+from marlyap.learning.algorithm import AbstractAlgorithm
+from marlyap.runs import config
+from marlyap.runs.run import Run
+from marlyap.runs.subject import subject
 from marlyap.tasks import TASKS
 
 
@@ -20,9 +20,9 @@ TINY = """--task.horizon 4 --steps 16 --schedule.environments 2 --schedule.steps
 --algorithm.actor_width 4 --algorithm.critic_width 4 --algorithm.batch 4""".split()
 OWN = """
 import jax.numpy as jnp
-from marlyap.algorithms import MASAC
-from marlyap.constraints import Lyapunov
-from marlyap.dynamics import SingleIntegrator
+from marlyap.learning.algorithms import MASAC
+from marlyap.learning.constraints import Lyapunov
+from marlyap.games.dynamics import SingleIntegrator
 from marlyap.tasks import Rendezvous
 
 class Vehicle(SingleIntegrator):

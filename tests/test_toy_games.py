@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Int
 
-from marlyap.algorithms import MADDPG, MASAC, CentralisedSAC, DecentralisedSAC
-from marlyap.constraints.lyapunov import Lyapunov
-from marlyap.dynamics import AbstractDynamics, SingleIntegrator
-from marlyap.evaluation import outcomes
-from marlyap.planar import AbstractPlanar, Goals
-from marlyap.rollout import Decentralised
-from marlyap.trainer import Schedule, Trainer
+from marlyap.games.dynamics import AbstractDynamics, SingleIntegrator
+from marlyap.games.planar import AbstractPlanar, Goals
+from marlyap.learning.algorithms import MADDPG, MASAC, CentralisedSAC, DecentralisedSAC
+from marlyap.learning.constraints.lyapunov import Lyapunov
+from marlyap.learning.trainer import Schedule, Trainer
+from marlyap.simulation.evaluation import outcomes
+from marlyap.simulation.rollout import Decentralised
 from marlyap.types import State
 
 

@@ -11,16 +11,16 @@ import pytest
 from conftest import same
 from jaxtyping import Array
 
-from marlyap.dynamics import SingleIntegrator
 from marlyap.errors import UserError
-from marlyap.evaluation import compare, episode, evaluate, pooled
-from marlyap.nets import Greedy, Sampled
-from marlyap.rollout import Decentralised
-from marlyap.schedule import Schedule
+from marlyap.games.dynamics import SingleIntegrator
+from marlyap.learning.schedule import Schedule
+from marlyap.learning.source import CostWindow, shape
+from marlyap.learning.trainer import Trainer
+from marlyap.nets.nets import Greedy, Sampled
 from marlyap.seeds import stream
-from marlyap.source import CostWindow, shape
+from marlyap.simulation.evaluation import compare, episode, evaluate, pooled
+from marlyap.simulation.rollout import Decentralised
 from marlyap.tasks import Rendezvous
-from marlyap.trainer import Trainer
 
 
 PURPOSES = ("train", "select", "evaluate", "calibrate", "certify", "perturb")

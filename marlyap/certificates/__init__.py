@@ -1,7 +1,7 @@
 """The certificates by name, configured. `Proof` is not listed: it needs a region."""
 
-from marlyap.certificate import AbstractCertificate
 from marlyap.certificates.basin import Basin
+from marlyap.certificates.certificate import AbstractCertificate
 from marlyap.certificates.closed_form import ClosedForm
 from marlyap.certificates.composition import Composition
 from marlyap.certificates.contraction import Contraction

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from marlyap.certificate import (
+from marlyap.certificates.certificate import (
     AbstractCertificate,
     Evidence,
     Judgement,
@@ -17,7 +17,7 @@ from marlyap.certificate import (
     until_step,
 )
 from marlyap.certificates.reach import ReachAndStay
-from marlyap.rollout import until
+from marlyap.simulation.rollout import until
 from marlyap.statistics import bonferroni, clopper_pearson, trials_needed
 
 

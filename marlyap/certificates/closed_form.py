@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from marlyap import graph as graphs
-from marlyap.certificate import AbstractCertificate, Evidence, Verdict
+from marlyap.certificates.certificate import AbstractCertificate, Evidence, Verdict
 from marlyap.certificates.model import SAMPLES, drawn, require_model, require_step
 from marlyap.controllers.point_offset import PointOffset
-from marlyap.dynamics import Unicycle
 from marlyap.errors import UserError
-from marlyap.planar import AbstractPlanar
+from marlyap.games.dynamics import Unicycle
+from marlyap.games.planar import AbstractPlanar
 
 
 def claim(offset: float, rate: float, level: float, sampled: float) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 import scipy  # its parts are loaded when they are first used
 
 from marlyap import graph as graphs
-from marlyap.certificate import (
+from marlyap.certificates.certificate import (
     AbstractCertificate,
     Evidence,
     Judgement,
@@ -21,7 +21,7 @@ from marlyap.certificate import (
     percent,
     until_step,
 )
-from marlyap.game import AbstractRegulation
+from marlyap.games.game import AbstractRegulation
 
 
 def claim(bound: float, rho: float, farthest: float, steps: int, dt: float) -> str:

@@ -7,7 +7,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from marlyap.certificate import (
+from marlyap.certificates.certificate import (
     AbstractCertificate,
     Evidence,
     Found,

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from marlyap.game import AbstractGame
-from marlyap.rollout import Controller, Decentralised, rollout
+from marlyap.games.game import AbstractGame
+from marlyap.simulation.rollout import Controller, Decentralised, rollout
 from marlyap.types import Action, Key, State, by_agent
 
 

@@ -10,10 +10,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from marlyap.certificate import AbstractCertificate, Evidence, Verdict
+from marlyap.certificates.certificate import AbstractCertificate, Evidence, Verdict
 from marlyap.certificates.jacobian import jacobian
-from marlyap.game import AbstractRegulation
-from marlyap.rollout import Controller
+from marlyap.games.game import AbstractRegulation
+from marlyap.simulation.rollout import Controller
 from marlyap.types import State
 
 

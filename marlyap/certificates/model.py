@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from marlyap.certificates.linearisation import as_double
-from marlyap.dynamics import AbstractDynamics
 from marlyap.errors import UserError
-from marlyap.game import AbstractRegulation
-from marlyap.identity import plain
-from marlyap.planar import AbstractPlanar, Goals
-from marlyap.rollout import Controller
+from marlyap.games.dynamics import AbstractDynamics
+from marlyap.games.game import AbstractRegulation
+from marlyap.games.planar import AbstractPlanar, Goals
+from marlyap.simulation.rollout import Controller
+from marlyap.storage.hashing import plain
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State
 

@@ -10,16 +10,16 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from marlyap import store
-from marlyap.certificate import AbstractCertificate, Evidence, Verdict
 from marlyap.certificates import bounds as B, model
 from marlyap.certificates.bounds import Affine
-from marlyap.dynamics import DoubleIntegrator, Unicycle
+from marlyap.certificates.certificate import AbstractCertificate, Evidence, Verdict
+from marlyap.certificates.lyapunov import Approach, Norm, Quadratic
 from marlyap.errors import UserError
-from marlyap.identity import policy_hash
-from marlyap.lyapunov_function import Approach, Norm, Quadratic
-from marlyap.nets import Actors, Greedy
-from marlyap.rollout import Decentralised
+from marlyap.games.dynamics import DoubleIntegrator, Unicycle
+from marlyap.nets.nets import Actors, Greedy
+from marlyap.simulation.rollout import Decentralised
+from marlyap.storage import store
+from marlyap.storage.hashing import policy_hash
 from marlyap.types import State
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from marlyap.certificate import (
+from marlyap.certificates.certificate import (
     AbstractCertificate,
     Evidence,
     Judgement,

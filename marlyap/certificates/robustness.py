@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from marlyap.certificate import (
+from marlyap.certificates.certificate import (
     AbstractCertificate,
     Evidence,
     Verdict,
@@ -21,9 +21,9 @@ from marlyap.certificate import (
 )
 from marlyap.certificates.reach import Reach
 from marlyap.errors import UserError
-from marlyap.game import AbstractRegulation
-from marlyap.perturb import Perturbed, edge_to_cut, follower_to_lose, traced
-from marlyap.rollout import Controller
+from marlyap.games.game import AbstractRegulation
+from marlyap.games.perturbed import Perturbed, edge_to_cut, follower_to_lose, traced
+from marlyap.simulation.rollout import Controller
 from marlyap.statistics import bonferroni
 from marlyap.types import Key
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from marlyap.certificate import (
+from marlyap.certificates.certificate import (
     AbstractCertificate,
     Evidence,
     Judgement,
@@ -21,7 +21,7 @@ from marlyap.certificate import (
     until_step,
 )
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
+from marlyap.games.game import AbstractGame
 
 
 def claim_safe(bound: float, game: str, steps: int, dt: float) -> str:

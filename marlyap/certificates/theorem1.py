@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from marlyap.certificate import (
+from marlyap.certificates.certificate import (
     AbstractCertificate,
     Evidence,
     Judgement,
@@ -20,11 +20,11 @@ from marlyap.certificate import (
     percent,
 )
 from marlyap.certificates.jacobian import jacobian
-from marlyap.dynamics import AbstractDynamics, Independent, Unicycle
-from marlyap.game import AbstractGame, AbstractRegulation
-from marlyap.layout import grad
-from marlyap.lyapunov_function import Norm
-from marlyap.rollout import Controller
+from marlyap.certificates.lyapunov import Norm
+from marlyap.games.dynamics import AbstractDynamics, Independent, Unicycle
+from marlyap.games.game import AbstractGame, AbstractRegulation
+from marlyap.nets.layout import grad
+from marlyap.simulation.rollout import Controller
 
 
 def claim(bound: float, V: str) -> str:

@@ -10,16 +10,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from marlyap import config
-from marlyap.algorithm import AbstractAlgorithm
-from marlyap.algorithms import ALGORITHMS, PRESETS
 from marlyap.certificates import CERTIFICATES
 from marlyap.controllers import CONTROLLERS, AbstractController
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
-from marlyap.sensing import Entry
+from marlyap.games.game import AbstractGame
+from marlyap.games.sensing import Entry
+from marlyap.learning.algorithm import AbstractAlgorithm
+from marlyap.learning.algorithms import ALGORITHMS, PRESETS
+from marlyap.learning.trainer import SCHEDULES
+from marlyap.runs import config
 from marlyap.tasks import TASKS
-from marlyap.trainer import SCHEDULES
 
 
 PRESET_NOTES = {

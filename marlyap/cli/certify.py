@@ -36,11 +36,11 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     if args.rollouts is not None:
         within("rollouts", args.rollouts, 1, 10_000_000)
     prepare()
-    from marlyap.certificate import sentence
-    from marlyap.certify import certify, save
+    from marlyap.certificates.certificate import sentence
+    from marlyap.certificates.certify import certify, save
+    from marlyap.certificates.lyapunov import cost_sum
     from marlyap.cli import claims
-    from marlyap.game import regulated
-    from marlyap.lyapunov_function import cost_sum
+    from marlyap.games.game import regulated
     from marlyap.seeds import stream
 
     controller, game, out = claims.about(args.run, args.task, args.algorithm, overrides, args.out)

@@ -28,7 +28,7 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     from rich.table import Table
 
     from marlyap.conformance import conformance
-    from marlyap.subject import asked
+    from marlyap.runs.subject import asked
 
     game = asked(args.task, overrides)
     within("seed", args.seed, 0, 2**31 - 1)

@@ -5,16 +5,16 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from marlyap import config
-from marlyap.certificate import AbstractCertificate
 from marlyap.certificates import CERTIFICATES
+from marlyap.certificates.certificate import AbstractCertificate
 from marlyap.certificates.safety import has_rules
 from marlyap.cli.common import Overrides, say
 from marlyap.controllers import names_a_controller
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
-from marlyap.run import one_run
-from marlyap.subject import asked, subject
+from marlyap.games.game import AbstractGame
+from marlyap.runs import config
+from marlyap.runs.run import one_run
+from marlyap.runs.subject import asked, subject
 
 
 SAMPLED = ("reach", "reach-and-stay", "decrease", "contraction", "basin", "quantiles")

@@ -35,9 +35,9 @@ STEPS = 204_800
 def run(args: Namespace, overrides: Overrides) -> Result:
     """Train, evaluate and report the main task; what is trained already is kept."""
     prepare(training=True)
-    from marlyap import groups
     from marlyap.cli import training
-    from marlyap.run import Run
+    from marlyap.runs import groups
+    from marlyap.runs.run import Run
 
     start = time.monotonic()
     places = [args.out / f"seed{s}" for s in training.seeds(args.seeds)]

@@ -33,9 +33,10 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     if args.out is not None and not args.out.parent.is_dir():
         raise UserError(f"out: there is no directory {args.out.parent}.")
     prepare()
-    from marlyap import groups, store
     from marlyap.cli import figures
-    from marlyap.subject import refuse_all_but_task
+    from marlyap.runs import groups
+    from marlyap.runs.subject import refuse_all_but_task
+    from marlyap.storage import store
 
     starts = starts_of(args.seed)
     refuse_all_but_task(overrides)

@@ -11,16 +11,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from marlyap import config, groups, store
-from marlyap.certificate import arrival
+from marlyap.certificates.certificate import arrival
 from marlyap.certificates.safety import has_rules
 from marlyap.cli.common import Overrides
 from marlyap.controllers import CONTROLLERS, names_a_controller
 from marlyap.errors import UserError
-from marlyap.evaluation import RESTS, evaluate
 from marlyap.report.contents import progress
-from marlyap.run import Run, expand
-from marlyap.subject import asked, subject
+from marlyap.runs import config, groups
+from marlyap.runs.run import Run, expand
+from marlyap.runs.subject import asked, subject
+from marlyap.simulation.evaluation import RESTS, evaluate
+from marlyap.storage import store
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ def exit_interrupted(*_: object) -> None:
 
 def tell_interrupted() -> None:
     """Say what an interrupt left behind."""
-    store = sys.modules.get("marlyap.store")
+    store = sys.modules.get("marlyap.storage.store")
     wrote = store is not None and bool(store.WRITTEN)
     what = "the files written until now are complete" if wrote else "nothing was written"
     with suppress(OSError):

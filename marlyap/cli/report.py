@@ -33,8 +33,8 @@ def options(p: ArgumentParser) -> None:
 def run(args: Namespace, overrides: Overrides) -> Result:
     """Write the HTML page and the pictures."""
     prepare()
-    from marlyap.run import expand
-    from marlyap.subject import subject
+    from marlyap.runs.run import expand
+    from marlyap.runs.subject import subject
 
     opened = [subject(d, args.task, args.algorithm, overrides) for d in expand(args.runs)]
     runs, games = [run for run, _ in opened], [game for _, game in opened]
@@ -50,10 +50,10 @@ def write(
 
     `task` is what the user called the games, where they are not the runs' own.
     """
-    from marlyap import store
     from marlyap.report.contents import gather
     from marlyap.report.page import html
     from marlyap.report.png import learning_curves_png, trajectories_png
+    from marlyap.storage import store
 
     if out.exists() and not is_report(out):
         raise UserError(f"out: {out} exists and is not a report of marlyap; choose another file.")

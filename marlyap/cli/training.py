@@ -7,19 +7,19 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from marlyap import config
-from marlyap.algorithm import AbstractAlgorithm
-from marlyap.algorithms import PRESETS
 from marlyap.cli.common import Overrides, say
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
-from marlyap.progress import show
-from marlyap.run import Run, expand
+from marlyap.games.game import AbstractGame
+from marlyap.learning.algorithm import AbstractAlgorithm
+from marlyap.learning.algorithms import PRESETS
+from marlyap.learning.trainer import Trainer, schedule_for
+from marlyap.runs import config
 from marlyap.runs.job import Launch
 from marlyap.runs.launch import launch
+from marlyap.runs.progress import show
+from marlyap.runs.run import Run, expand
 from marlyap.runs.stop import Stop
-from marlyap.subject import supplies
-from marlyap.trainer import Trainer, schedule_for
+from marlyap.runs.subject import supplies
 
 
 @dataclass(frozen=True)

@@ -28,13 +28,14 @@ def options(p: ArgumentParser) -> None:
 def run(args: Namespace, overrides: Overrides) -> Result:
     """Film one episode."""
     prepare()
-    from marlyap import groups, store
     from marlyap.report.data import Page
     from marlyap.report.episodes import one
     from marlyap.report.gif import film_gif
     from marlyap.report.page import html
-    from marlyap.run import one_run
-    from marlyap.subject import subject
+    from marlyap.runs import groups
+    from marlyap.runs.run import one_run
+    from marlyap.runs.subject import subject
+    from marlyap.storage import store
 
     run, game = subject(one_run(args.run), args.task, args.algorithm, overrides)
     place = args.out or run.directory

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from marlyap.controllers.controller import left
-from marlyap.planar import AbstractPlanar
+from marlyap.games.planar import AbstractPlanar
 
 
 class Cascade(eqx.Module):

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from marlyap.errors import UserError
-from marlyap.game import AbstractGame
-from marlyap.planar import AbstractPlanar
+from marlyap.games.game import AbstractGame
+from marlyap.games.planar import AbstractPlanar
 from marlyap.types import Action, Key, State
 
 

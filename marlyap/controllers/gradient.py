@@ -4,8 +4,8 @@ import jax
 
 from marlyap.controllers.cascade import Cascade
 from marlyap.controllers.controller import AbstractController, as_action, mean_pull
-from marlyap.dynamics import Unicycle
-from marlyap.planar import AbstractPlanar
+from marlyap.games.dynamics import Unicycle
+from marlyap.games.planar import AbstractPlanar
 
 
 class GradientConsensus(AbstractController):

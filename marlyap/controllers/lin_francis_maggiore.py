@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 
 from marlyap.controllers.controller import AbstractController, as_action, headings, mean_pull
-from marlyap.dynamics import Unicycle
-from marlyap.planar import AbstractPlanar
+from marlyap.games.dynamics import Unicycle
+from marlyap.games.planar import AbstractPlanar
 
 
 class LinFrancisMaggiore(AbstractController):

@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from marlyap.controllers.controller import AbstractController
-from marlyap.dynamics import Unicycle
 from marlyap.errors import UserError
-from marlyap.planar import AbstractPlanar
-from marlyap.rollout import AbstractPlanner
+from marlyap.games.dynamics import Unicycle
+from marlyap.games.planar import AbstractPlanar
+from marlyap.simulation.rollout import AbstractPlanner
 from marlyap.types import Action, Key, State
 
 

@@ -7,8 +7,8 @@ from jaxtyping import Array, Int
 from marlyap import graph as graphs
 from marlyap.controllers.cascade import Cascade
 from marlyap.controllers.controller import AbstractController, as_action, headings
-from marlyap.dynamics import LateUnicycle, Unicycle
-from marlyap.planar import AbstractPlanar
+from marlyap.games.dynamics import LateUnicycle, Unicycle
+from marlyap.games.planar import AbstractPlanar
 from marlyap.types import State
 
 

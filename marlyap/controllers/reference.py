@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from marlyap.controllers.controller import AbstractController
-from marlyap.game import AbstractGame
+from marlyap.games.game import AbstractGame
 
 
 class Zero(AbstractController):

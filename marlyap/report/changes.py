@@ -6,12 +6,12 @@ from typing import Any
 
 import equinox as eqx
 
-from marlyap import config
-from marlyap.algorithms import ALGORITHMS, PRESETS
 from marlyap.errors import UserError
-from marlyap.run import Run
+from marlyap.learning.algorithms import ALGORITHMS, PRESETS
+from marlyap.learning.trainer import schedule_for
+from marlyap.runs import config
+from marlyap.runs.run import Run
 from marlyap.tasks import TASKS
-from marlyap.trainer import schedule_for
 
 
 def common(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -5,13 +5,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from marlyap import groups, store
-from marlyap.certificate import percent
+from marlyap.certificates.certificate import percent
+from marlyap.certificates.lyapunov import CostSum
 from marlyap.errors import UserError
-from marlyap.evaluation import evaluate
-from marlyap.game import AbstractGame, regulated
-from marlyap.identity import plain, policy_hash
-from marlyap.lyapunov_function import CostSum
+from marlyap.games.game import AbstractGame, regulated
 from marlyap.report.changes import changed_fields, command_of, common
 from marlyap.report.data import (
     Claim,
@@ -29,7 +26,11 @@ from marlyap.report.data import (
 )
 from marlyap.report.episodes import films, worst_case
 from marlyap.report.slices import slices
-from marlyap.run import Run
+from marlyap.runs import groups
+from marlyap.runs.run import Run
+from marlyap.simulation.evaluation import evaluate
+from marlyap.storage import store
+from marlyap.storage.hashing import plain, policy_hash
 
 
 MEASURED = (

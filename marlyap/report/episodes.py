@@ -6,16 +6,16 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from marlyap import groups
-from marlyap.certificate import start_of
+from marlyap.certificates.certificate import start_of
+from marlyap.certificates.lyapunov import CostSum
 from marlyap.errors import UserError
-from marlyap.evaluation import episode
-from marlyap.game import AbstractGame, AbstractRegulation
-from marlyap.lyapunov_function import CostSum
+from marlyap.games.game import AbstractGame, AbstractRegulation
 from marlyap.report.data import Film, Frames
-from marlyap.rollout import Controller, rollout, until
-from marlyap.run import Run
+from marlyap.runs import groups
+from marlyap.runs.run import Run
 from marlyap.seeds import Purpose, stream
+from marlyap.simulation.evaluation import episode
+from marlyap.simulation.rollout import Controller, rollout, until
 from marlyap.types import Key, State, Trajectory
 
 

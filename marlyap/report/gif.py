@@ -25,7 +25,7 @@ from marlyap.report.scene import (
     framed,
     scenes,
 )
-from marlyap.store import write_bytes_atomic
+from marlyap.storage.store import write_bytes_atomic
 
 
 MOST_FRAMES = 120

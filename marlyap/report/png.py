@@ -10,7 +10,7 @@ from marlyap.errors import UserError
 from marlyap.report import charts, plot
 from marlyap.report.data import Film, Trained
 from marlyap.report.scene import INK, SOFT, scenes
-from marlyap.store import write_bytes_atomic
+from marlyap.storage.store import write_bytes_atomic
 
 
 MOST_SHOWN = 12

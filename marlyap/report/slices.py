@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from marlyap import graph as graphs
-from marlyap.game import AbstractRegulation
-from marlyap.lyapunov_function import CostSum
-from marlyap.planar import AbstractPlanar
+from marlyap.certificates.lyapunov import CostSum
+from marlyap.games.game import AbstractRegulation
+from marlyap.games.planar import AbstractPlanar
 from marlyap.report.data import Slice
 
 

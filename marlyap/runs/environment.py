@@ -2,7 +2,7 @@
 
 import os
 
-from marlyap.cache import enable_cache
+from marlyap.compute.cache import enable_cache
 
 
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda"}  # JAX's names

@@ -13,13 +13,13 @@ from typing import IO, Any
 
 import jax
 
-from marlyap import config, events
-from marlyap.algorithm import AbstractAlgorithm
 from marlyap.errors import UserError
-from marlyap.fit import Diverged, fit
-from marlyap.game import AbstractGame
-from marlyap.run import Run
+from marlyap.games.game import AbstractGame
+from marlyap.learning.algorithm import AbstractAlgorithm
+from marlyap.runs import config, events
+from marlyap.runs.fit import Diverged, fit
 from marlyap.runs.job import Job, Launch
+from marlyap.runs.run import Run
 
 
 WORKER = (sys.executable, "-m", "marlyap.runs.worker")

@@ -19,9 +19,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TextIO
 
-from marlyap import events
 from marlyap.errors import UserError, explained
-from marlyap.runs import environment
+from marlyap.runs import environment, events
 from marlyap.runs.job import Job
 from marlyap.runs.stop import Stop
 

@@ -1,6 +1,6 @@
 """The tasks that can be asked for by name: configured objects, so a name is a preset."""
 
-from marlyap.dynamics import LateUnicycle, Unicycle
+from marlyap.games.dynamics import LateUnicycle, Unicycle
 from marlyap.tasks.formation import Formation as Formation
 from marlyap.tasks.rendezvous import Rendezvous as Rendezvous
 

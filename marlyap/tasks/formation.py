@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from marlyap.dynamics import AbstractDynamics, Unicycle
 from marlyap.errors import UserError, within
-from marlyap.planar import AbstractPlanar, Goals
+from marlyap.games.dynamics import AbstractDynamics, Unicycle
+from marlyap.games.planar import AbstractPlanar, Goals
 from marlyap.tasks.rendezvous import scatter, with_motion
 from marlyap.types import State
 

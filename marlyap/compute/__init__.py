@@ -1,0 +1,1 @@
+"""What changes speed only: devices, and what is compiled once and kept."""

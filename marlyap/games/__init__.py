@@ -1,0 +1,1 @@
+"""What is played: plants, games, what agents see, and perturbations of a game."""

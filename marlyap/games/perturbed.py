@@ -1,0 +1,281 @@
+"""The same game, disturbed: what a controller meets that it was not made for."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from marlyap import graph as graphs
+from marlyap.errors import UserError
+from marlyap.games.dynamics import AbstractDynamics
+from marlyap.games.game import AbstractGame, AbstractRegulation
+from marlyap.games.physics import AbstractPlant
+from marlyap.seeds import branch
+from marlyap.types import State
+
+
+class Perturbed(AbstractRegulation):
+    """`inner` with stronger or weaker inputs, noise, delay, lost messages, agents or edges.
+
+    A controller made for `inner` drives it unchanged. Every method of `inner` is asked, with the
+    state as `inner` knows it, so that whatever a task replaces is what is perturbed; perturbations
+    may be nested. Agents that are gone are seen by nobody and judged by nobody.
+
+    What is drawn at random (noise, lost messages) follows from a seed that `reset` leaves in the
+    state's memory, beside the actions under way and the memory of `inner`.
+
+    Raises UserError for values out of range, and for `gone` where `inner` has a judgement of its
+    own about the whole team, which cannot leave an agent out.
+    """
+
+    inner: AbstractRegulation
+    gain: float | Array = 1.0  # the inputs have this many times their nominal effect
+    noise: float | Array = 0.0  # standard deviation of what is added to each action in [-1, 1]
+    delay: int = 0  # steps until an action has its effect; until then there is none
+    drop: float | Array = 0.0  # probability that in a step an agent does not see a neighbour
+    gone: tuple[int, ...] = ()  # agents that are missing
+    cut: tuple[tuple[int, int], ...] = ()  # edges that are missing
+    spread: float | Array = 1.0  # starts lie this many times as far out
+
+    def __check_init__(self):
+        if not 0 < self.gain < 100 or not 0 < self.spread < 100:
+            raise UserError("perturbation: gain and spread must lie between 0 and 100.")
+        if not 0 <= self.noise < 100 or not 0 <= self.drop <= 1 or not 0 <= self.delay <= 1000:
+            raise UserError("perturbation: noise, delay and drop must not be negative, drop <= 1.")
+        missing = {*self.gone, *(i for edge in self.cut for i in edge)}
+        if not missing <= set(range(self.inner.agents)):
+            raise UserError(f"perturbation: {sorted(missing)} names an agent that is not there.")
+        if self.gone and self.inner.plant.coupled:
+            raise UserError(
+                f"perturbation: an agent of {type(self.inner).__name__} cannot be taken away, "
+                "since its plant couples the agents; leave out gone."
+            )
+        own = judges_as_a_team(self.inner)
+        if self.gone and own:
+            raise UserError(
+                f"perturbation: an agent of {own[0]} cannot be taken away, since it replaces "
+                f"`{own[1]}`, which judges the whole team; leave out gone."
+            )
+
+    # What the game inside says.
+    agents = property(lambda self: self.inner.agents)  # pyright: ignore[reportAssignmentType]
+    graph = property(lambda self: self.inner.graph)  # pyright: ignore[reportAssignmentType]
+    dt = property(lambda self: self.inner.dt)  # pyright: ignore[reportAssignmentType]
+    horizon = property(lambda self: self.inner.horizon)  # pyright: ignore[reportAssignmentType]
+
+    @property
+    def slots(self) -> Int[np.ndarray, "agent slot"]:
+        """Those of the game inside: the shape of what agents see stays."""
+        return self.inner.slots
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "inner":
+            raise AttributeError(name)
+        return getattr(self.inner, name)
+
+    @property
+    def driven(self) -> AbstractGame:
+        """The game inside, with inputs as strong as they are here."""
+        return self.inner.strengthened(self.gain) if _on(self.gain - 1) else self.inner
+
+    @property
+    def plant(self) -> AbstractPlant:
+        return self.driven.plant
+
+    @property
+    def dynamics(self) -> AbstractDynamics:
+        """Of a planar game."""
+        return self.driven.dynamics  # pyright: ignore
+
+    @property
+    def present(self) -> Bool[np.ndarray, "agent"]:
+        return ~np.isin(np.arange(self.agents), self.gone)
+
+    @property
+    def adjacency(self) -> Bool[np.ndarray, "agent agent"]:
+        """The edges that are left."""
+        linked = self.inner.adjacency & self.present[:, None] & self.present[None, :]
+        for a, b in self.cut:
+            linked[a, b] = linked[b, a] = False
+        return linked
+
+    def strengthened(self, gain):
+        return dataclasses.replace(self, inner=self.inner.strengthened(gain))
+
+    def inside(self, state: State) -> State:
+        """The state as the game inside knows it."""
+        memory = state.memory["inner"]
+        return State(x=state.x, scenario=state.scenario, t=state.t, memory=memory)
+
+    def reset(self, key):
+        start = self.inner.reset(key)
+        if _on(self.spread - 1):
+            start = self.inner.farther(start, self.spread)
+        seed = branch(key, "perturb")
+        for _ in range(depth(self.inner)):  # nested perturbations draw other numbers
+            seed = jax.random.fold_in(seed, 3)
+        idle = self.inner.hold(start)
+        queue = jnp.broadcast_to(idle, (self.delay, *idle.shape))
+        memory = {"seed": jax.random.key_data(seed), "queue": queue, "inner": start.memory}
+        return State(x=start.x, scenario=start.scenario, t=start.t, memory=memory)
+
+    def linked(self, state):
+        linked = self.inner.linked(self.inside(state)) & jnp.asarray(self.adjacency)
+        if not _on(self.drop):
+            return linked
+        key = jax.random.fold_in(self._key(state, 1), state.t)
+        return linked & ~jax.random.bernoulli(key, self.drop, linked.shape)
+
+    def observe(self, state, links):
+        return self.inner.observe(self.inside(state), links)
+
+    def observation_entries(self):
+        return self.inner.observation_entries()
+
+    def step(self, state, action):
+        queue = jnp.concatenate([state.memory["queue"], action[None]])
+        now, key = queue[0], jax.random.fold_in(self._key(state, 2), state.t)
+        if _on(self.noise):
+            now = now + self.noise * jax.random.normal(key, now.shape)
+        after = self.driven.step(self.inside(state), now)
+        memory = state.memory | {"queue": queue[1:], "inner": after.memory}
+        return State(x=after.x, scenario=after.scenario, t=after.t, memory=memory)
+
+    def outside(self, inside: State, state: State) -> State:
+        """A state of the game inside, with what this one remembers in `state`."""
+        memory = state.memory | {"inner": inside.memory}
+        return State(x=inside.x, scenario=inside.scenario, t=inside.t, memory=memory)
+
+    def features(self, state):
+        return self.inner.features(self.inside(state))
+
+    def terminated(self, state):
+        return self.inner.terminated(self.inside(state))
+
+    def failed(self, state):
+        return self.inner.failed(self.inside(state))
+
+    @property
+    def failure_cost(self):
+        return self.inner.failure_cost
+
+    @property
+    def edge(self):
+        return self.inner.edge
+
+    @property
+    def unit(self):
+        return self.inner.unit
+
+    @property
+    def tolerances(self):
+        return self.inner.tolerances
+
+    @property
+    def leads(self):
+        return self.inner.leads
+
+    @property
+    def kinds(self):
+        return self.inner.kinds
+
+    def error_entries(self):
+        return self.inner.error_entries()
+
+    def hold(self, state):
+        return self.inner.hold(self.inside(state))
+
+    def at_target(self, state):
+        return self.outside(self.inner.at_target(self.inside(state)), state)
+
+    def farther(self, state, factor):
+        return self.outside(self.inner.farther(self.inside(state), factor), state)
+
+    def aside(self, state, gone):
+        return self.outside(self.inner.aside(self.inside(state), gone), state)
+
+    def scene(self, state):
+        return self.inner.scene(self.inside(state))
+
+    def signals(self, state):
+        return self.inner.signals(self.inside(state))
+
+    def resized(self, agents):
+        return dataclasses.replace(self, inner=self.inner.resized(agents))
+
+    def positions(self, state):
+        return self.inner.positions(self.inside(state))
+
+    def distance(self, state):
+        return self._of_those_present(self.inner.distance(self.inside(state)))
+
+    def costs(self, state, action):
+        return self._of_those_present(self.inner.costs(self.inside(state), action))
+
+    def rewards(self, state, action):
+        return self._of_those_present(self.inner.rewards(self.inside(state), action))
+
+    def errors(self, state):
+        errors = self.inner.errors(self.inside(state))
+        return jnp.where(jnp.asarray(self.present)[:, None], errors, 0.0)
+
+    def success(self, state):
+        return super().success(state) if self.gone else self.inner.success(self.inside(state))
+
+    def violations(self, state):
+        # Nobody collides with an agent that is gone.
+        there = self.inner.violations(self.inner.aside(self.inside(state), ~self.present))
+        return there & jnp.asarray(self.present)
+
+    def _of_those_present(self, values: Float[Array, "agent"]) -> Float[Array, "agent"]:
+        return jnp.where(jnp.asarray(self.present), values, 0.0)
+
+    def _key(self, state: State, purpose: int) -> Array:
+        return jax.random.fold_in(jax.random.wrap_key_data(state.memory["seed"]), purpose)
+
+
+def depth(game: AbstractGame) -> int:
+    """How many perturbations lie one inside the other."""
+    return 1 + depth(game.inner) if isinstance(game, Perturbed) else 0
+
+
+def judges_as_a_team(game: AbstractGame) -> tuple[str, str] | None:
+    """The task and its own method that judges all agents together, if it replaces one."""
+    if isinstance(game, Perturbed):
+        return judges_as_a_team(game.inner)
+    for name in ("success", "terminated", "failed"):
+        if getattr(type(game), name) is not getattr(AbstractGame, name):
+            return type(game).__name__, name
+    return None
+
+
+def traced(game: Perturbed) -> Perturbed:
+    """The same with its numbers as arrays, so that jit compiles once for all of their values."""
+    numbers = lambda g: (g.gain, g.noise, g.drop, g.spread)
+    return eqx.tree_at(numbers, game, tuple(jnp.asarray(float(x)) for x in numbers(game)))
+
+
+def _on(x: float | Array) -> bool:
+    return not isinstance(x, (int, float)) or x != 0
+
+
+def edge_to_cut(game: AbstractGame) -> tuple[int, int] | None:
+    """The last edge without which the graph is still connected; else the last edge, if any."""
+    linked = game.adjacency
+    edges = [(int(a), int(b)) for a, b in np.argwhere(np.triu(linked))]
+    for a, b in reversed(edges):
+        without = linked.copy()
+        without[a, b] = without[b, a] = False
+        if (graphs.hops(without, (0,)) >= 0).all():
+            return a, b
+    return edges[-1] if edges else None
+
+
+def follower_to_lose(game: AbstractGame) -> int | None:
+    """The last agent that is no leader, if any."""
+    others = np.flatnonzero(~game.leads)
+    return int(others[-1]) if len(others) else None

@@ -1,0 +1,1 @@
+"""Algorithms, constraints, and the training loop on the device."""

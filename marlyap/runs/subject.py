@@ -1,0 +1,69 @@
+"""What a command is asked to measure: a run's policy, on the run's own game or on another."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from marlyap.errors import UserError
+from marlyap.games.game import AbstractGame
+from marlyap.learning.algorithm import AbstractAlgorithm
+from marlyap.runs import config
+from marlyap.runs.run import Run
+
+
+def subject(
+    directory: Path | str,
+    task: str | None = None,
+    algorithm: str | None = None,
+    overrides: Mapping[str, str] | None = None,
+) -> tuple[Run, AbstractGame]:
+    """Open a run, and the game that its policy is to be measured on.
+
+    `task` and `algorithm` are what the user typed after --task and --algorithm. A task is the
+    game to measure on. Where the run's game is of the user's own class, the name of that class,
+    or the one it was trained under, supplies its code: the game is then the run's own, with the
+    values that run.json holds. `overrides` ("task.agents": "5") change fields of either.
+
+    The game is `run.game` itself where nothing differs from it. Whether the policy fits it is for
+    `run.controller(game)` to say. Raises UserError for what cannot be done.
+    """
+    overrides = overrides or {}
+    refuse_all_but_task(overrides)
+    given = config.load(task, AbstractGame) if task else None
+    rule = config.load(algorithm, AbstractAlgorithm) if algorithm else None
+    run = Run.open(Path(directory), given, rule)
+    if rule is not None and not config.own_classes(run.trainer.algorithm):
+        raise UserError(
+            f"algorithm: {directory} was trained by {run.labels['algorithm']}, which is part of "
+            "marlyap; leave --algorithm out."
+        )
+    game = run.game
+    if task and given is not None and not supplies(task, given, run):
+        game = given
+    game = changed(game, overrides)
+    same = type(game) is type(run.game) and config.record(game) == config.record(run.game)
+    return run, run.game if same else game
+
+
+def asked(task: str, overrides: Mapping[str, str] | None = None) -> AbstractGame:
+    """The task that was named, with some fields set anew: what a controller is measured on."""
+    return changed(config.load(task, AbstractGame), overrides or {})
+
+
+def changed(game: AbstractGame, overrides: Mapping[str, str]) -> AbstractGame:
+    """The game with some of its fields set anew, as by {"task.agents": "5"}."""
+    refuse_all_but_task(overrides)
+    return config.override_all({"task": game}, overrides)["task"]
+
+
+def refuse_all_but_task(overrides: Mapping[str, str]) -> None:
+    """Raise UserError for what only a training can set."""
+    for path in overrides:
+        if path.partition(".")[0] != "task":
+            raise UserError(f"--{path}: only a training sets it; here --task.FIELD can be set.")
+
+
+def supplies(task: str, given: AbstractGame, run: Run) -> bool:
+    """Whether the named task is the code of the run's own game."""
+    name = task.rpartition(":")[2]
+    own = type(given) is type(run.game) and bool(config.own_classes(given))
+    return own and name in (type(run.game).__name__, run.labels["task"])

@@ -1,0 +1,1 @@
+"""Episodes of a game under a controller, and what is measured on them."""

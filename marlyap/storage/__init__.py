@@ -1,0 +1,1 @@
+"""Arrays and text on disk, durable and checked."""
