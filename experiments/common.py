@@ -58,7 +58,7 @@ from marlyap.tasks import TASKS
 Row = dict[str, Any]
 TINY = {"actor_width": 8, "critic_width": 8, "batch": 16}
 QUICK = Schedule(
-    steps=320, environments=4, steps_per_update=32, warmup=160, judge_every=1, judge_episodes=8
+    steps=320, environments=4, steps_per_update=32, warmup=160, select_every=1, select_episodes=8
 )
 TOGETHER = 4  # cases that are trained before they are measured
 RADIUS = 0.1  # m, of success where there is one only

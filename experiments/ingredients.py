@@ -25,7 +25,7 @@ WITHOUT = {
     "without averaged weights": ({"ema_rate": 1.0}, {}),
     "without the doubled reward": ({"reward_scale": 1.0}, {}),
     "16 environments": ({}, {"environments": 16}),
-    "1 environment": ({}, {"environments": 1, "judge_every": 512}),
+    "1 environment": ({}, {"environments": 1, "select_every": 512}),
     "update every 2 steps": ({}, {"steps_per_update": 2}),
     "update every 32 steps": ({}, {"steps_per_update": 32}),
     "critic 256 wide": ({"critic_width": 256}, {}),
@@ -36,7 +36,7 @@ WITH = {
     "paper and LayerNorm": ({"normalise": True}, {}),
     "paper and a head for each agent": ({"heads": "agent"}, {}),
     "paper and averaged weights": ({"ema_rate": TUNED.ema_rate}, {}),
-    "paper and 64 environments": ({}, {"environments": 64, "judge_every": 4}),
+    "paper and 64 environments": ({}, {"environments": 64, "select_every": 4}),
 }
 
 

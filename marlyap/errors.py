@@ -25,7 +25,7 @@ class UserError(Exception):
         return " ".join(visible.split())
 
 
-def within(
+def check_range(
     name: str, value: float | int, low: float | int, high: float | int, open: bool = False
 ) -> None:
     """Raise UserError unless low <= value <= high; `open` leaves `low` itself out."""

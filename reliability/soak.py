@@ -59,7 +59,12 @@ def main() -> int:
     game = Rendezvous(agents=2, horizon=4, dynamics=SingleIntegrator())
     algorithm = MASAC(actor_width=4, critic_width=4, batch=4, constraint=Lyapunov())
     schedule = Schedule(
-        steps=10**9, environments=2, steps_per_update=4, warmup=8, capacity=4_000, judge_every=10**9
+        steps=10**9,
+        environments=2,
+        steps_per_update=4,
+        warmup=8,
+        capacity=4_000,
+        select_every=10**9,
     )
     trainer, dice = Trainer(game, algorithm, schedule), random.Random(args.seed)
     with tempfile.TemporaryDirectory() as place:

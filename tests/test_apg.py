@@ -66,7 +66,7 @@ def test_the_decrease_condition_counts_what_it_should():
 def test_a_small_team_is_solved(weight):
     game = Rendezvous(agents=2, horizon=8, dynamics=SingleIntegrator(limits=(3.0, 3.0)), dt=0.2)
     algorithm = APG(actor_width=32, rate_pi=5e-3, ema_rate=0.1, weight=weight, T=4)
-    schedule = Schedule(steps=8 * 64 * 150, environments=64, judge_every=150, judge_episodes=100)
+    schedule = Schedule(steps=8 * 64 * 150, environments=64, select_every=150, select_episodes=100)
     trained = train(game, algorithm, schedule)
     assert [line["iteration"] for line in trained.history] == list(range(1, 151))
     assert trained.history[-1]["updates"] == 150

@@ -31,7 +31,7 @@ def run(tmp_path_factory):
     """An untrained policy of two single integrators too slow to get anywhere."""
     game = Rendezvous(agents=2, horizon=12, dynamics=SingleIntegrator((0.1, 0.1)))
     algorithm = MASAC(batch=4, actor_width=4, critic_width=4, constraint=Lyapunov(horizon=4))
-    schedule = Schedule(steps=24, environments=2, steps_per_update=12, warmup=12, judge_episodes=2)
+    schedule = Schedule(steps=24, environments=2, steps_per_update=12, warmup=12, select_episodes=2)
     trainer = Trainer(game, algorithm, schedule)
     run = Run.create(tmp_path_factory.mktemp("certify") / "run", trainer, 0, NAMED)
     run.save(run.load()[0], 0.0)

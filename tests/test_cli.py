@@ -27,7 +27,7 @@ from marlyap.storage import store
 FIT = importlib.import_module("marlyap.runs.fit")
 TINY = """--task.agents 2 --task.horizon 4 --task.dynamics single-integrator --steps 48
 --schedule.environments 2 --schedule.steps_per_update 4 --schedule.warmup 8 --schedule.capacity 40
---schedule.judge_every 4 --schedule.judge_episodes 4
+--schedule.select_every 4 --schedule.select_episodes 4
 --algorithm.actor_width 4 --algorithm.critic_width 4 --algorithm.batch 4""".split()
 VERBS = sorted(TABLE)
 

@@ -25,7 +25,7 @@ assert len(jax.devices()) == 4
 sides = {n: list(devices.mesh_for(n).shape.values()) for n in (1, 2, 3, 4, 6, 8)}
 
 # Keys are shared out where that can be done evenly, and not changed by it.
-draw = lambda n: jax.vmap(jax.random.normal)(devices.spread(jax.random.split(jax.random.key(0), n)))
+draw = lambda n: jax.vmap(jax.random.normal)(devices.shard(jax.random.split(jax.random.key(0), n)))
 together = [np.asarray(jax.jit(draw, static_argnums=0)(n)) for n in (8, 7)]
 with devices.using(devices.mesh_for(1)):
     apart = [jax.jit(draw, static_argnums=0)(n) for n in (8, 7)]
@@ -42,8 +42,8 @@ kept = [whole["x"].sharding.is_fully_replicated, parts["x"].sharding.spec == P("
 
 # Two runs on two devices each, against two runs on one device.
 algorithm = MASAC(batch=8, actor_width=4, critic_width=4)
-plan = Schedule(steps=16, environments=4, steps_per_update=4, warmup=8, judge_every=1,
-                judge_episodes=4)
+plan = Schedule(steps=16, environments=4, steps_per_update=4, warmup=8, select_every=1,
+                select_episodes=4)
 trainer = Trainer(Rendezvous(horizon=2), algorithm, plan)
 
 def trained(folder):

@@ -9,7 +9,7 @@ import pytest
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-SHORT = {r"steps=[\d_]+": "steps=640, environments=4, warmup=160, judge_episodes=20"}
+SHORT = {r"steps=[\d_]+": "steps=640, environments=4, warmup=160, select_episodes=20"}
 
 
 def blocks(page: Path) -> list[str]:

@@ -11,7 +11,7 @@ from marlyap import MASAC, Schedule, evaluate, train
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 EXAMPLES = sorted(Path(__file__).parents[1].glob("examples/*.py"))
 # The README's block is shortened to the same, so that they share what is compiled.
-SMALL = dict(steps=640, environments=4, warmup=160, judge_episodes=20)
+SMALL = dict(steps=640, environments=4, warmup=160, select_episodes=20)
 
 
 def load(name):
@@ -40,7 +40,7 @@ def test_train(capsys):
 
 def test_own_task():
     game = load("02_own_task").Corner()
-    schedule = Schedule(steps=320, environments=2, warmup=80, judge_episodes=4)
+    schedule = Schedule(steps=320, environments=2, warmup=80, select_episodes=4)
     small = MASAC(actor_width=4, critic_width=4, batch=4)
     trained = train(game, small, schedule)
     assert evaluate(game, trained.controller, 4).final.shape == (4,)

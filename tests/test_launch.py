@@ -16,7 +16,7 @@ from marlyap.runs.stop import Stop
 
 TINY = MASAC(actor_width=4, critic_width=4, batch=4)
 PLAN = Schedule(
-    steps=16, environments=2, steps_per_update=4, warmup=8, capacity=40, judge_episodes=2
+    steps=16, environments=2, steps_per_update=4, warmup=8, capacity=40, select_episodes=2
 )
 GAME = Rendezvous(agents=2, horizon=4, dynamics=SingleIntegrator())
 EVENTS = [

@@ -128,7 +128,7 @@ def run(tmp_path_factory):
     trainer = Trainer(
         Rendezvous(graph="path/2", horizon=4),
         MASAC(**TINY, shared=True, critic="mean-field", heads="agent"),
-        Schedule(steps=8, environments=2, steps_per_update=4, warmup=4, judge_episodes=2),
+        Schedule(steps=8, environments=2, steps_per_update=4, warmup=4, select_episodes=2),
     )
     run = Run.create(tmp_path_factory.mktemp("many") / "run", trainer, 0, {})
     carry, _, _ = run.load()

@@ -253,7 +253,7 @@ def test_what_is_drawn_is_what_the_game_says(oracle):
 
 def test_training_plays_and_selects_by_what_the_game_says():
     schedule = Schedule(
-        steps=48, environments=4, steps_per_update=24, warmup=24, judge_every=1, judge_episodes=16
+        steps=48, environments=4, steps_per_update=24, warmup=24, select_every=1, select_episodes=16
     )
     trainer = Trainer(GAME, MASAC(actor_width=8, critic_width=8, batch=8), schedule)
     carry, _ = eqx.filter_jit(trainer.begin)(jax.random.key(0))
@@ -262,7 +262,7 @@ def test_training_plays_and_selects_by_what_the_game_says():
     assert obs.shape[-1] == GAME.observations(GAME.reset(KEYS[0])).shape[1]
     assert np.allclose(obs[1, :, -2:], np.asarray(kept.action)[0, 0], atol=1e-6)  # its memory
     assert np.allclose(np.asarray(kept.reward)[:4], 1 - np.asarray(kept.cost)[:4], atol=1e-5)
-    _, look = eqx.filter_jit(trainer.judge)(carry)
+    _, look = eqx.filter_jit(trainer.select_best)(carry)
     policy = trainer.algorithm.policy(carry.learner.networks)
     keys = jax.random.split(stream(0, "select"), 16)
     found = outcomes(GAME, Decentralised(policy, GAME), keys)

@@ -15,7 +15,7 @@ from marlyap.storage import store
 
 
 TINY = """--task.horizon 4 --steps 16 --schedule.environments 2 --schedule.steps_per_update 4
---schedule.warmup 8 --schedule.capacity 40 --schedule.judge_episodes 2
+--schedule.warmup 8 --schedule.capacity 40 --schedule.select_episodes 2
 --algorithm.actor_width 4 --algorithm.critic_width 4 --algorithm.batch 4""".split()
 HEAD = """import jax.numpy as jnp
 import numpy as np

@@ -14,7 +14,7 @@ from marlyap.compute import cache
 
 
 SCHEDULE = Schedule(
-    steps=16, environments=2, steps_per_update=4, warmup=8, capacity=40, judge_episodes=2
+    steps=16, environments=2, steps_per_update=4, warmup=8, capacity=40, select_episodes=2
 )
 TINY = MASAC(actor_width=4, critic_width=4, batch=4)
 

@@ -41,7 +41,7 @@ from marlyap.recheck.world import World, adjacency, hops, places
 from marlyap.simulation.rollout import Decentralised, rollout
 from marlyap.statistics import lower_bound, quantile_upper_bound, trials_needed
 from marlyap.storage import store
-from marlyap.storage.hashing import named_arrays, plain, policy_hash, without_arrays, words
+from marlyap.storage.hashing import as_json, named_arrays, policy_hash, without_arrays, words
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.threefry import fold, normal, uniform, uniform64
 
@@ -745,8 +745,8 @@ def test_it_knows_what_robustness_sweeps(graph, agents):
     sim = World.__new__(World)
     sim.linked = adjacency(graph, agents)
     sim.slots, sim.leads = places(sim.linked, graph), np.isin(np.arange(agents), game.leaders)
-    said = {name: plain(change) for name, change in asked.perturbations(game).items()}
-    assert swept(sim, plain(asked)) == said
+    said = {name: as_json(change) for name, change in asked.perturbations(game).items()}
+    assert swept(sim, as_json(asked)) == said
 
 
 # --- What it does not know -----------------------------------------------------------------------
@@ -760,7 +760,7 @@ def of(game, controller, V=None):
     arrays |= {f"V/{k}": v for k, v in named_arrays(V).items()}
     arrays = {k: np.asarray(v) for k, v in arrays.items()}
     meta = {"game": game, "controller": without_arrays(controller), "V": without_arrays(V)}
-    return World(json.loads(json.dumps(plain(meta) | {"seed": 7})), arrays)
+    return World(json.loads(json.dumps(as_json(meta) | {"seed": 7})), arrays)
 
 
 class MovingRing(Rendezvous):
@@ -794,11 +794,11 @@ def test_it_names_what_it_does_not_know():
 
 
 def test_own_code_is_marked():
-    assert plain(GAME)["kind"] == "Rendezvous" and plain(MovingRing())["kind"].endswith(
+    assert as_json(GAME)["kind"] == "Rendezvous" and as_json(MovingRing())["kind"].endswith(
         "(own code)"
     )
-    assert plain(OwnRendezvous())["kind"] == "Rendezvous (own code)"
-    nested = plain(Rendezvous(dynamics=type("Unicycle", (Unicycle,), {"__module__": "x"})()))
+    assert as_json(OwnRendezvous())["kind"] == "Rendezvous (own code)"
+    nested = as_json(Rendezvous(dynamics=type("Unicycle", (Unicycle,), {"__module__": "x"})()))
     assert nested["dynamics"]["kind"] == "Unicycle (own code)"
 
 

@@ -49,8 +49,8 @@ SCHEDULE = Schedule(
     steps_per_update=4,
     warmup=8,
     capacity=40,  # ten episodes: full after four iterations, overwritten from the fifth
-    judge_every=4,
-    judge_episodes=4,
+    select_every=4,
+    select_episodes=4,
 )
 SINGLE, PAIR = (5,), (5, 6)
 
@@ -187,10 +187,10 @@ def test_each_algorithm_and_each_reading_resumes_bit_for_bit(
         return trace
 
     with monkeypatch.context() as patched:
-        for part in ("begin", "iterate", "judge"):
+        for part in ("begin", "iterate", "select_best"):
             patched.setattr(Trainer, part, counted(part))
         whole = uninterrupted(name, SINGLE)
-    assert traces == {"begin": 1, "iterate": 1, "judge": 1}
+    assert traces == {"begin": 1, "iterate": 1, "select_best": 1}
     monkeypatch.setenv(export_cache.FOLDER, str(tmp_path / "programs"))
     (run,) = runs_in(tmp_path, name, SINGLE)
     list(fit([run], until(5)))
@@ -643,7 +643,7 @@ def test_a_pair_is_refused_when_one_of_them_is_in_use(tmp_path):
         pass
 
 
-ENDLESS = dataclasses.replace(SCHEDULE, steps=10**9, judge_every=10**9)
+ENDLESS = dataclasses.replace(SCHEDULE, steps=10**9, select_every=10**9)
 EAGER = """
 import sys
 import marlyap.runs.fit as f

@@ -38,7 +38,7 @@ def trainer(game, masac):
         warmup=20,
         capacity=54,
         decay=0.1,
-        judge_episodes=64,
+        select_episodes=64,
     )
     return Trainer(game, masac, schedule)
 
@@ -195,15 +195,15 @@ def test_bad_schedules_are_named():
 
 
 def test_the_best_policy_is_kept(trainer, later):
-    judge = eqx.filter_jit(lambda trainer, carry: trainer.judge(carry))
-    carry, info = judge(trainer, later[1])
+    select_best = eqx.filter_jit(lambda trainer, carry: trainer.select_best(carry))
+    carry, info = select_best(trainer, later[1])
     policy = Decentralised(Greedy(later[1].learner.networks.pi_mean), trainer.game)
     final = evaluate(trainer.game, policy, 64, 0, "select").final
     assert float(info["success"]) == pytest.approx(np.mean(final <= trainer.game.radius))
     assert float(info["distance"]) == pytest.approx(np.mean(final), rel=1e-4)
     assert same(carry.best, trainer.algorithm.policy(later[1].learner.networks))
     unbeaten = eqx.tree_at(lambda c: c.score, later[1], jnp.asarray(2.0))
-    kept, _ = judge(trainer, unbeaten)
+    kept, _ = select_best(trainer, unbeaten)
     assert same(kept.best, later[1].best) and float(kept.score) == 2
     assert same(kept.learner, later[1].learner)
 

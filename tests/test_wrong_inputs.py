@@ -15,7 +15,7 @@ from marlyap.cli import main
 
 
 SMALL = """--task.horizon 4 --steps 16 --schedule.environments 2 --schedule.steps_per_update 4
---schedule.warmup 8 --schedule.capacity 40 --schedule.judge_episodes 2
+--schedule.warmup 8 --schedule.capacity 40 --schedule.select_episodes 2
 --algorithm.actor_width 4 --algorithm.critic_width 4 --algorithm.batch 4"""
 RUN, CERTIFICATE = "RUN", "CERTIFICATE"  # replaced by a small trained run and its certificate
 
@@ -159,8 +159,8 @@ CASES = [
             ("--schedule.warmup", ["-1", "x"]),
             ("--schedule.capacity", ["0"]),
             ("--schedule.decay", ["0", "2", "nan"]),
-            ("--schedule.judge_every", ["0"]),
-            ("--schedule.judge_episodes", ["0"]),
+            ("--schedule.select_every", ["0"]),
+            ("--schedule.select_episodes", ["0"]),
             ("--schedule.nosuch", ["1"]),
         ],
         "--schedule.",

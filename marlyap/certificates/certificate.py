@@ -22,9 +22,9 @@ from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame, AbstractRegulation
 from marlyap.games.perturbed import Perturbed
 from marlyap.seeds import Purpose, stream
-from marlyap.simulation.rollout import Controller, finite, rollout, until
+from marlyap.simulation.rollout import Controller, all_finite, rollout, until
 from marlyap.statistics import lower_bound, trials_needed
-from marlyap.storage.hashing import plain
+from marlyap.storage.hashing import as_json
 from marlyap.types import Key, Scalar, State, Trajectory
 
 
@@ -51,7 +51,7 @@ class Verdict:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain JSON values; what is not finite is null."""
-        return plain(dataclasses.asdict(self))
+        return as_json(dataclasses.asdict(self))
 
 
 def percent(share: float, up: bool = False) -> str:
@@ -155,7 +155,7 @@ def _judge(
     def one(trajectory: Trajectory, index: Array) -> dict[str, Any]:
         trajectory = until(trajectory, steps)
         own = jax.random.fold_in(jax.random.fold_in(key, index), 2)
-        found, sound = judge(game, V, trajectory, own), finite(trajectory)
+        found, sound = judge(game, V, trajectory, own), all_finite(trajectory)
         # The last states have too few after them for a V that looks ahead.
         values = V.along(game, trajectory, steps + 1 - V.beyond) if uses_V else jnp.zeros(1)
         return {
@@ -228,7 +228,7 @@ def worst_of(
         "episode": episode,
         "failed": not bool(found.holds[episode]),
         "badness": float(found.badness[episode]),
-        "state": plain({"x": start.x, "scenario": start.scenario}),
+        "state": as_json({"x": start.x, "scenario": start.scenario}),
         "figures": figures,
     }
 

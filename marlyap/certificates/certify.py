@@ -17,7 +17,7 @@ from marlyap.simulation.evaluation import drives
 from marlyap.simulation.rollout import Controller
 from marlyap.statistics import bonferroni
 from marlyap.storage import store
-from marlyap.storage.hashing import named_arrays, plain, policy_hash, without_arrays, words
+from marlyap.storage.hashing import as_json, named_arrays, policy_hash, without_arrays, words
 from marlyap.types import Key
 
 
@@ -88,10 +88,10 @@ def certify(
         "checkpoints": checkpoints,
         "seed": seed,
         "policy": digest,
-        "game": plain(game),
-        "controller": plain(without_arrays(controller)),
-        "V": plain(without_arrays(V)),
-        "certificates": {name: plain(c) for name, c in asked.items()},
+        "game": as_json(game),
+        "controller": as_json(without_arrays(controller)),
+        "V": as_json(without_arrays(V)),
+        "certificates": {name: as_json(c) for name, c in asked.items()},
         "verdicts": {name: verdict.as_dict() for name, verdict in verdicts.items()},
     }
 
@@ -144,4 +144,4 @@ def save(
     arrays["controller/words"] = words(controller)
     arrays |= {f"V/{k}": v for k, v in named_arrays(V).items()}
     arrays = {k: np.asarray(v) for k, v in arrays.items()}
-    store.write(Path(directory), KIND, arrays, plain(dict(result)), replace=replace)
+    store.write(Path(directory), KIND, arrays, as_json(dict(result)), replace=replace)

@@ -13,7 +13,7 @@ from marlyap.games.dynamics import AbstractDynamics
 from marlyap.games.game import AbstractRegulation
 from marlyap.games.planar import AbstractPlanar, Goals
 from marlyap.simulation.rollout import Controller
-from marlyap.storage.hashing import plain
+from marlyap.storage.hashing import as_json
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State
 
@@ -44,7 +44,7 @@ def require_model(
             f"{name}: its formulas are about {known} with Euler steps, not "
             f"{type(game.dynamics).__name__} with {game.dynamics.integrator}."
         )
-    if plain(controller.game) != plain(game):
+    if as_json(controller.game) != as_json(game):
         raise UserError(f"{name}: the controller was made for another game than this one.")
 
 

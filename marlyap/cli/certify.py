@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from marlyap.cli.common import Overrides, Result, say
 from marlyap.cli.environment import prepare
 from marlyap.cli.options import OWN_TASK, SUBJECT, measured_on, number, place
-from marlyap.errors import UserError, within
+from marlyap.errors import UserError, check_range
 
 
 SUMMARY = "say what holds of a run or controller, with what evidence"
@@ -34,7 +34,7 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     if not 0 < args.confidence < 1:
         raise UserError(f"confidence: {args.confidence} must lie between 0 and 1.")
     if args.rollouts is not None:
-        within("rollouts", args.rollouts, 1, 10_000_000)
+        check_range("rollouts", args.rollouts, 1, 10_000_000)
     prepare()
     from marlyap.certificates.certificate import sentence
     from marlyap.certificates.certify import certify, save

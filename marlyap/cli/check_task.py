@@ -5,7 +5,7 @@ from argparse import ArgumentParser, Namespace
 from marlyap.cli.common import Overrides, Result
 from marlyap.cli.environment import prepare
 from marlyap.cli.options import NAMED, ON_TASK, number
-from marlyap.errors import within
+from marlyap.errors import check_range
 
 
 SUMMARY = "check a task against the laws that training and certificates rely on"
@@ -31,7 +31,7 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     from marlyap.runs.subject import asked
 
     game = asked(args.task, overrides)
-    within("seed", args.seed, 0, 2**31 - 1)
+    check_range("seed", args.seed, 0, 2**31 - 1)
     found = conformance(game, args.seed)
     broken = [f.law for f in found if f.faults]
     skipped = [f.law for f in found if f.faults is None]

@@ -47,7 +47,7 @@ def kept(tree: Tree, several: bool) -> Tree:
     return _constrained(tree, _spec(several))
 
 
-def spread(keys: Keys) -> Keys:
+def shard(keys: Keys) -> Keys:
     """Inside a compiled function: share out what is played with these keys over a run's devices."""
     return _constrained(keys, PartitionSpec(EPISODES))
 

@@ -28,7 +28,7 @@ from jax import export
 
 from marlyap.errors import UserError
 from marlyap.storage import store
-from marlyap.storage.hashing import plain, words
+from marlyap.storage.hashing import as_json, words
 
 
 FOLDER = "MARLYAP_PROGRAMS"
@@ -62,7 +62,7 @@ def compiled(
         tree, info = f(maker, eqx.combine(structure.unflatten(leaves), fixed))
         return jax.tree.leaves(eqx.filter(tree, _has_shape)), info
 
-    about = [f.__qualname__, plain(maker), words(argument).tobytes().decode(), str(structure)]
+    about = [f.__qualname__, as_json(maker), words(argument).tobytes().decode(), str(structure)]
     place = Path(folder, _digest(*about, [str(s) for s in shapes], donate))
     run = jax.jit(_kept(place, flat, shapes).call, donate_argnums=0 if donate else ())
     shaped, fixed_after = eqx.partition(like(), _has_shape)

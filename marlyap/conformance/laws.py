@@ -157,9 +157,9 @@ class Probe:
     def look(self, states: State, actions: Any, game: AbstractGame | None = None) -> dict[str, Any]:
         """`see` for ROWS states: one compilation serves all laws, and its traces are counted."""
         arrays = jax.tree.map(jnp.asarray, (states, actions))
-        return plain(self._look(game or self.game, *arrays))
+        return as_numpy(self._look(game or self.game, *arrays))
 
-    def target(self, states: State | None = None) -> State:
+    def on_target(self, states: State | None = None) -> State:
         """The same episodes on the target set, of a game that has one."""
         assert isinstance(self.game, AbstractRegulation)
         arrays = jax.tree.map(jnp.asarray, states or self.states)
@@ -168,14 +168,14 @@ class Probe:
     def fresh(self) -> State:
         """The first start, uncompiled."""
         with jax.disable_jit():
-            return plain(self.game.reset(self.keys[0]))
+            return as_numpy(self.game.reset(self.keys[0]))
 
     @cached_property
     def alone(self) -> list[dict[str, Any]]:
         """The first moment, the last and the first again, each by itself and uncompiled."""
         with jax.disable_jit():
             return [
-                plain(see(self.game, *rows((self.states, self.actions), r))) for r in ENDS + [0]
+                as_numpy(see(self.game, *rows((self.states, self.actions), r))) for r in ENDS + [0]
             ]
 
     @cached_property
@@ -183,7 +183,7 @@ class Probe:
         """The first moment and the last, vmapped and uncompiled."""
         with jax.disable_jit():
             look = jax.vmap(lambda s, a: see(self.game, s, a))
-            return plain(look(*rows((self.states, self.actions), ENDS)))
+            return as_numpy(look(*rows((self.states, self.actions), ENDS)))
 
 
 def is_key(leaf: Any) -> bool:
@@ -196,7 +196,7 @@ def kept(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf if is_key(leaf) else np.asarray(leaf), tree)
 
 
-def plain(tree: Any) -> Any:
+def as_numpy(tree: Any) -> Any:
     """The same tree in NumPy, random keys as their bits."""
     bits = lambda leaf: jax.random.key_data(leaf) if is_key(leaf) else leaf
     return jax.tree.map(lambda leaf: np.asarray(bits(leaf)), tree)
@@ -237,7 +237,7 @@ def _is_float(leaf: Any) -> bool:
 
 def flat(tree: Any) -> np.ndarray:
     """All numbers of each row of a batch, whole ones and keys too [row, number]."""
-    leaves = [leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(plain(tree))]
+    leaves = [leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(as_numpy(tree))]
     return np.concatenate(leaves, axis=1) if leaves else np.zeros((ROWS, 0))
 
 
@@ -414,8 +414,8 @@ def finite(probe: Probe) -> Faults:
 
 def deterministic(probe: Probe) -> Faults:
     """The same key gives the same episode, bit for bit."""
-    again = plain(_play(probe.game, probe.keys))
-    pairs = zip(jax.tree.leaves(plain(probe.played)), jax.tree.leaves(again), strict=True)
+    again = as_numpy(_play(probe.game, probe.keys))
+    pairs = zip(jax.tree.leaves(as_numpy(probe.played)), jax.tree.leaves(again), strict=True)
     if not all(np.array_equal(a, b, equal_nan=True) for a, b in pairs):
         yield "step: the same key gave two different episodes; draw everything from the key."
     if different({"reset": probe.fresh()}, {"reset": probe.fresh()}, exact=True):
@@ -527,7 +527,7 @@ def target(probe: Probe) -> Faults:
     """On the target set errors are zero and success holds; the holding action keeps it."""
     if not isinstance(probe.game, AbstractRegulation):
         return
-    there = probe.target()
+    there = probe.on_target()
     out = probe.look(there, probe.look(there, 0 * probe.actions)["hold"])
     small = 1e-5 * (1 + np.abs(flat(_numbers(probe.states.x))).max())
     if not np.all(out["success"]):
@@ -565,7 +565,7 @@ def features(probe: Probe) -> Faults:
     """Features begin with the errors, agent by agent."""
     if not isinstance(probe.game, AbstractRegulation):
         return
-    there = probe.look(probe.target(), 0 * probe.actions)
+    there = probe.look(probe.on_target(), 0 * probe.actions)
     for out in (probe.seen, there):
         errors, seen = out["errors"], out["features"]
         begin = seen[:, :, : errors.shape[2]]
@@ -582,7 +582,7 @@ def costs(probe: Probe) -> Faults:
     """Costs are at least 0, 0 on the target set, and the team's is their mean (Assumption 1)."""
     cost, there = probe.seen["costs"], np.zeros(1)
     if isinstance(probe.game, AbstractRegulation):
-        goal = probe.target()
+        goal = probe.on_target()
         there = probe.look(goal, probe.look(goal, 0 * probe.actions)["hold"])["costs"]
     probe.figures |= {"largest": float(cost.max()), "on target": float(np.abs(there).max())}
     if cost.min() < 0 or there.min() < 0:
@@ -654,7 +654,7 @@ def _steepest(probe: Probe, f: Callable[[dict[str, Any]], Any]) -> tuple[float, 
     near = (flat(_numbers(probe.states.x)), probe.actions)
     far = (near[0][other], near[1][other])
     if isinstance(probe.game, AbstractRegulation):
-        goal = probe.target()
+        goal = probe.on_target()
         hold = probe.look(goal, 0 * probe.actions)["hold"]
         far = (
             np.where(half[:, None], far[0], flat(_numbers(goal.x))),

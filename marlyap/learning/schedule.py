@@ -2,7 +2,7 @@
 
 import equinox as eqx
 
-from marlyap.errors import whole_fields, within
+from marlyap.errors import check_range, whole_fields
 
 
 class Schedule(eqx.Module):
@@ -15,8 +15,8 @@ class Schedule(eqx.Module):
     capacity: int = 1_024_000  # environment steps that the replay memory holds
     decay: float = 0.1  # learning rates are multiplied by this ...
     decay_episodes: int | None = None  # ... every so many episodes (None: over the whole run)
-    judge_every: int = 8  # iterations between looks at the policy
-    judge_episodes: int = 500  # starts on which the best policy so far is chosen
+    select_every: int = 8  # iterations between evaluations of the policy
+    select_episodes: int = 500  # starts on which the best policy so far is chosen
 
     def __check_init__(self):
         whole_fields(self)
@@ -26,13 +26,13 @@ class Schedule(eqx.Module):
             ("steps_per_update", 1, 10**9),
             ("warmup", 0, 10**9),
             ("capacity", 1, 10**9),
-            ("judge_every", 1, 10**9),
-            ("judge_episodes", 1, 10**6),
+            ("select_every", 1, 10**9),
+            ("select_episodes", 1, 10**6),
         ):
-            within(name, getattr(self, name), low, high)
-        within("decay", self.decay, 0, 1, open=True)
+            check_range(name, getattr(self, name), low, high)
+        check_range("decay", self.decay, 0, 1, open=True)
         if self.decay_episodes is not None:
-            within("decay_episodes", self.decay_episodes, 1, 10**12)
+            check_range("decay_episodes", self.decay_episodes, 1, 10**12)
 
     def updates(self, steps: int) -> int:
         """Gradient steps for so many environment steps: one at least."""
@@ -49,6 +49,6 @@ SCHEDULES = {
         warmup=1_000,
         decay=0.075,
         decay_episodes=2_000,
-        judge_every=50,
+        select_every=50,
     ),
 }

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 
-from marlyap.compute.devices import spread
+from marlyap.compute.devices import shard
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
 from marlyap.learning.replay import Episode
@@ -90,7 +90,7 @@ class Simulated(AbstractSource):
                 terminated=long.terminated[: game.horizon],
             )
 
-        return jax.vmap(one)(spread(jax.random.split(key, episodes)))
+        return jax.vmap(one)(shard(jax.random.split(key, episodes)))
 
 
 class Play(eqx.Module):

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
-from marlyap.compute.devices import spread
+from marlyap.compute.devices import shard
 from marlyap.games.game import AbstractGame
 from marlyap.learning.algorithm import AbstractAlgorithm, Info, KeyPair, Watch, unwatched
 from marlyap.learning.health import Health
@@ -71,20 +71,20 @@ class Trainer(eqx.Module):
         after = Carry(learner, key, carry.iteration + 1, carry.best, carry.score)
         return after, info._replace(health=health)
 
-    def judge(self, carry: Carry) -> tuple[Carry, dict[str, Scalar]]:
-        """Look at the policy from starts kept for this alone, and keep it if it is the best.
+    def select_best(self, carry: Carry) -> tuple[Carry, dict[str, Scalar]]:
+        """Evaluate the policy from starts kept for this alone, and keep it if it is the best.
 
         Its score is the success rate, plus a tenth of that at half the radius. Ties are broken by
         how far and how fast the agents end, which count for less than one start in all.
         """
         policy = self.algorithm.policy(self.algorithm.networks(carry.learner))
-        keys = spread(jax.random.split(stream(0, "select"), self.schedule.judge_episodes))
+        keys = shard(jax.random.split(stream(0, "select"), self.schedule.select_episodes))
         seen = outcomes(self.game, Decentralised(policy, self.game), keys)
         rate = lambda hits: jnp.mean(hits.astype(float))
         near = rate(seen.success & (seen.final <= self.game.edge / 2))
         less = lambda x, unit: jnp.mean(jnp.nan_to_num(1 / (1 + x / unit)))
         tie = less(seen.final, self.game.edge) + less(seen.speed + seen.spin, 1.0)
-        score = rate(seen.success) + 0.1 * near + 0.02 * tie / self.schedule.judge_episodes
+        score = rate(seen.success) + 0.1 * near + 0.02 * tie / self.schedule.select_episodes
         better = score >= carry.score
         keep = lambda new, old: jnp.where(better, new, old) if eqx.is_array(new) else new
         best = jax.tree.map(keep, policy, carry.best)

@@ -101,9 +101,9 @@ def total(x: Float[Array, "*stack in batch"]) -> Float[Array, "*stack 1 batch"]:
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(1,))
-def spread(x: Float[Array, "*stack 1 batch"], size: int) -> Float[Array, "*stack in batch"]:
+def broadcast(x: Float[Array, "*stack 1 batch"], size: int) -> Float[Array, "*stack in batch"]:
     """`x` for each of `size` features; its gradient is a `total`."""
     return jnp.broadcast_to(x, (*x.shape[:-2], size, x.shape[-1]))
 
 
-spread.defvjp(lambda x, size: (spread(x, size), None), lambda size, _, g: (total(g),))
+broadcast.defvjp(lambda x, size: (broadcast(x, size), None), lambda size, _, g: (total(g),))

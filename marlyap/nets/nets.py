@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from marlyap.nets.layout import batch_last, matmul, rows_as_columns, spread, total
+from marlyap.nets.layout import batch_last, broadcast, matmul, rows_as_columns, total
 from marlyap.simulation.rollout import AbstractExplorer
 from marlyap.types import Action, Features, Key, Obs, Scalar
 
@@ -47,7 +47,7 @@ class Layer(eqx.Module):
         y = matmul(centred(self.weight, -2), x) + centred(self.bias, -1)[..., None]
         scale = jax.lax.rsqrt(total(y * y) / y.shape[-2] + EPS)
         gain, offset = self.norm
-        return y * spread(scale, y.shape[-2]) * gain[..., None] + offset[..., None]
+        return y * broadcast(scale, y.shape[-2]) * gain[..., None] + offset[..., None]
 
     def lipschitz(self) -> Scalar:
         """An upper bound: the spectral norm of W, and what LayerNorm may stretch next to 0."""

@@ -191,7 +191,10 @@ def strict(raw: bytes) -> Any:
     """JSON without a key written twice, NaN, infinity, half a surrogate pair or deep nesting."""
     try:
         value = json.loads(
-            raw.decode(), object_pairs_hook=unique, parse_float=finite, parse_constant=finite
+            raw.decode(),
+            object_pairs_hook=unique,
+            parse_float=finite_number,
+            parse_constant=finite_number,
         )
         if deep(value, DEEPEST):
             raise ValueError("it is nested too deeply")
@@ -215,7 +218,7 @@ def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def finite(text: str) -> float:
+def finite_number(text: str) -> float:
     """A number that is finite."""
     if not math.isfinite(number := float(text)):
         raise ValueError(f"{text[:20]} is not a finite number")

@@ -30,7 +30,7 @@ from marlyap.runs import groups
 from marlyap.runs.run import Run
 from marlyap.simulation.evaluation import evaluate
 from marlyap.storage import store
-from marlyap.storage.hashing import plain, policy_hash
+from marlyap.storage.hashing import as_json, policy_hash
 
 
 MEASURED = (
@@ -239,7 +239,7 @@ def certificates(run: Run, game: AbstractGame, label: str) -> Certified:
     except UserError as error:
         return Certified(notes=(f"{run.directory}: its certificate is left out: {error}",))
     other = "policy" * (meta["policy"] != policy_hash(run.controller()))
-    if other or meta["game"] != plain(game):
+    if other or meta["game"] != as_json(game):
         other = other or "game"
         note = f"{run.directory}: its certificate is left out, because it is of another {other}."
         return Certified(notes=(note,))

@@ -158,16 +158,16 @@ def advance(
     done, mesh = int(np.min(carry.iteration)), devices.mesh_for(carry.iteration.size)
     carry = devices.placed(carry, carry.iteration.ndim > 0, mesh)
     compiled = lambda f: export_cache.compiled(f, trainer, carry, lambda: carry, donate=True)
-    iterate = judge = None
+    iterate = select = None
     while done < trainer.iterations and not stop():
         done += 1
         with devices.using(mesh):
             iterate = iterate or compiled(_iterate)
             carry, info = iterate(carry)
             log, health = info["log"], info["health"]
-            if done % trainer.schedule.judge_every == 0 or done == trainer.iterations:
-                judge = judge or compiled(_judge)
-                carry, look = judge(carry)
+            if done % trainer.schedule.select_every == 0 or done == trainer.iterations:
+                select = select or compiled(_select_best)
+                carry, look = select(carry)
                 log |= look
         yield done, carry, Told(*jax.tree.map(np.atleast_1d, (log, Health(**health))))
 
@@ -327,8 +327,8 @@ def _iterate(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
     return _each(told, carry)
 
 
-def _judge(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
-    return _each(trainer.judge, carry)
+def _select_best(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
+    return _each(trainer.select_best, carry)
 
 
 def _line(

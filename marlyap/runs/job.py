@@ -4,7 +4,7 @@ import dataclasses
 import json
 from dataclasses import dataclass
 
-from marlyap.errors import UserError, within
+from marlyap.errors import UserError, check_range
 
 
 CHOICES = {
@@ -32,7 +32,7 @@ class Launch:
                 *first, last = [choice for choice in choices if choice]
                 allowed = f"{', '.join(first)} or {last}"
                 raise UserError(f"{field.replace('_', '-')}: '{value}' must be {allowed}.")
-        within("attempts", self.attempts, 1, 1000)
+        check_range("attempts", self.attempts, 1, 1000)
 
     @property
     def tries(self) -> int:

@@ -16,7 +16,7 @@ QUIET = 30.0  # seconds without a line, at most, where there is no terminal
 def show(happening: Iterable[events.Event], plain: bool = True) -> None:
     """A bar for each run: steps, speed, return, success, time left.
 
-    Where there is no terminal or notebook: with `plain`, a line at each judgement and at least
+    Where there is no terminal or notebook: with `plain`, a line at each evaluation and at least
     every QUIET seconds; else nothing.
     """
     columns = (

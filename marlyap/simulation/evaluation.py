@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
 from marlyap.seeds import Purpose, stream
-from marlyap.simulation.rollout import AbstractPlanner, Controller, finite, rollout, until
+from marlyap.simulation.rollout import AbstractPlanner, Controller, all_finite, rollout, until
 from marlyap.statistics import clopper_pearson, mcnemar
 from marlyap.types import Key, Keys, Scalar, State, Trajectory
 
@@ -48,13 +48,13 @@ def outcome(game: AbstractGame, trajectory: Trajectory) -> Outcome:
     success = jax.vmap(game.success)(trajectory.state)
     inside = success[: game.horizon + 1]
     lasts = jnp.cumprod(inside[::-1])[::-1].astype(bool)
-    sound = finite(seen)
+    sound = all_finite(seen)
     return Outcome(
         success=inside[-1] & sound,
         failed=game.failed(last),
         final=jnp.where(sound, jnp.max(game.distance(last)), jnp.nan),
         held=jnp.all(inside[-HELD:]) & sound,
-        stayed=jnp.all(success[game.horizon :]) & finite(trajectory),
+        stayed=jnp.all(success[game.horizon :]) & all_finite(trajectory),
         speed=jnp.max(speed),
         spin=jnp.max(spin),
         settled=jnp.where(lasts[-1] & sound, jnp.argmax(lasts) * game.dt, jnp.inf),

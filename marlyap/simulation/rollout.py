@@ -117,7 +117,7 @@ def first_fault(x: Float[Array, "episode time agent *rest"]) -> Int[Array, ""]:
     return jnp.where(jnp.any(bad), jnp.argmax(bad), -1)
 
 
-def finite(tree: PyTree) -> Bool[Array, ""]:
+def all_finite(tree: PyTree) -> Bool[Array, ""]:
     """Whether every number in the tree is finite."""
     numbers = [x for x in jax.tree.leaves(tree) if eqx.is_inexact_array(x)]
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in numbers]))

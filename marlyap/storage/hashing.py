@@ -19,7 +19,7 @@ def policy_hash(controller: Any) -> str:
 
 def words(controller: Any) -> np.ndarray:
     """Of what the controller is made of, all that is not an array, as bytes of JSON."""
-    text = json.dumps(plain(without_arrays(controller)), sort_keys=True)
+    text = json.dumps(as_json(without_arrays(controller)), sort_keys=True)
     return np.frombuffer(text.encode(), np.uint8)
 
 
@@ -38,7 +38,7 @@ def without_arrays(tree: Any) -> Any:
     return eqx.filter(tree, eqx.is_array, inverse=True)
 
 
-def plain(value: Any) -> Any:
+def as_json(value: Any) -> Any:
     """Modules, arrays and numbers as JSON values; what is not finite becomes null.
 
     The kind of a module is the name of its class, with "(own code)" behind it where the class is
@@ -48,15 +48,15 @@ def plain(value: Any) -> Any:
         ours = type(value).__module__.startswith("marlyap.")
         kind = {"kind": type(value).__name__ + ("" if ours else " (own code)")}
         fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
-        return kind | plain(fields)
+        return kind | as_json(fields)
     if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {str(k): as_json(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
+        return [as_json(v) for v in value]
     if isinstance(value, (np.ndarray, jax.Array)):
-        return plain(np.asarray(value).tolist())
+        return as_json(np.asarray(value).tolist())
     if isinstance(value, np.generic):
-        return plain(value.item())
+        return as_json(value.item())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if isinstance(value, (str, int, bool, type(None))) else str(value)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from marlyap.errors import UserError, within
+from marlyap.errors import UserError, check_range
 from marlyap.games.dynamics import AbstractDynamics, Unicycle
 from marlyap.games.planar import AbstractPlanar, Goals
 from marlyap.tasks.rendezvous import scatter, with_motion
@@ -34,8 +34,8 @@ class Formation(AbstractPlanar):
     def __check_init__(self):
         if not 0 < self.spread < 1e6:
             raise UserError(f"spread: {self.spread} m must be a positive distance in metres.")
-        within("rest_weight", self.rest_weight, 0, 1e6)
-        within("clearance", self.clearance, 0, 1e6)
+        check_range("rest_weight", self.rest_weight, 0, 1e6)
+        check_range("clearance", self.clearance, 0, 1e6)
 
     def reset(self, key):
         k_start, k_turn = jax.random.split(key)

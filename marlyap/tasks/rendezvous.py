@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from marlyap.errors import UserError, within
+from marlyap.errors import UserError, check_range
 from marlyap.games.dynamics import AbstractDynamics, Unicycle
 from marlyap.games.planar import AbstractPlanar, Goals
 from marlyap.types import Key, State
@@ -31,7 +31,7 @@ class Rendezvous(AbstractPlanar):
     def __check_init__(self):
         if not 0 < self.size < 1e6:
             raise UserError(f"size: {self.size} m must be a positive distance in metres.")
-        within("rest_weight", self.rest_weight, 0, 1e6)
+        check_range("rest_weight", self.rest_weight, 0, 1e6)
 
     def reset(self, key):
         return scatter(self.dynamics, self.agents, self.size, key)

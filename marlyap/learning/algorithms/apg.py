@@ -23,8 +23,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from marlyap.compute.devices import spread
-from marlyap.errors import within
+from marlyap.compute.devices import shard
+from marlyap.errors import check_range
 from marlyap.games.game import AbstractGame
 from marlyap.learning.algorithm import AbstractAlgorithm, Info, Log, unwatched
 from marlyap.learning.health import Health, first_negative
@@ -44,7 +44,7 @@ class APG(AbstractAlgorithm):
     """Analytic policy gradients: learns by differentiating the game, so the model must be known."""
 
     # 1,500 updates on 128 episodes each: playing is cheap where no critic is to be learnt.
-    default_schedule = Schedule(steps=7_680_000, environments=128, judge_every=50)
+    default_schedule = Schedule(steps=7_680_000, environments=128, select_every=50)
 
     rate_pi: float = 2e-3  # learning rate
     actor_width: int = 64  # units in each of two hidden layers
@@ -57,14 +57,14 @@ class APG(AbstractAlgorithm):
     decrease: float = 0.1  # share by which the cost has to fall over T steps
 
     def __check_init__(self):
-        within("rate_pi", self.rate_pi, 0, 1)
-        within("ema_rate", self.ema_rate, 0, 1, open=True)
-        within("decrease", self.decrease, 0, 1)
-        within("clip", self.clip, 0, 1e6, open=True)
-        within("actor_width", self.actor_width, 1, 1_000_000)
-        within("T", self.T, 1, 10_000)
+        check_range("rate_pi", self.rate_pi, 0, 1)
+        check_range("ema_rate", self.ema_rate, 0, 1, open=True)
+        check_range("decrease", self.decrease, 0, 1)
+        check_range("clip", self.clip, 0, 1e6, open=True)
+        check_range("actor_width", self.actor_width, 1, 1_000_000)
+        check_range("T", self.T, 1, 10_000)
         for name in ("sharpness", "weight"):
-            within(name, getattr(self, name), 0, 1e6)
+            check_range(name, getattr(self, name), 0, 1e6)
 
     def init(self, shape, key):
         pi = Actors(shape, self.actor_width, self.shared, key=key)
@@ -80,7 +80,7 @@ class APG(AbstractAlgorithm):
 
     def iterate(self, learner, play, keys, decay, watch=unwatched):
         """One update on fresh episodes, whose gradient is taken through the game."""
-        starts = spread(jax.random.split(keys.play, play.schedule.environments))
+        starts = shard(jax.random.split(keys.play, play.schedule.environments))
         learner, log, health = self.improve(learner, play.source.model(), starts, decay)
         seen = jax.tree.map(lambda x: x[None], watch(learner))
         return learner, Info(log, health, seen)

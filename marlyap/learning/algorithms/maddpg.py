@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from marlyap.errors import within
+from marlyap.errors import check_range
 from marlyap.learning.algorithms.masac import PLAIN
 from marlyap.learning.off_policy import AbstractOffPolicy
 from marlyap.learning.optimiser import TrainState, polyak
@@ -65,16 +65,16 @@ class MADDPG(AbstractOffPolicy):
 
     def __check_init__(self):
         for name in ("gamma", "tau", "ema_rate"):
-            within(name, getattr(self, name), 0, 1, open=name != "gamma")
+            check_range(name, getattr(self, name), 0, 1, open=name != "gamma")
         for name in ("rate_pi", "rate_Q"):
-            within(name, getattr(self, name), 0, 1)
+            check_range(name, getattr(self, name), 0, 1)
         for name in ("noise", "reward_scale"):
-            within(name, getattr(self, name), 0, 1e6, open=True)
+            check_range(name, getattr(self, name), 0, 1e6, open=True)
         for name in ("smoothing", "smoothing_clip"):
-            within(name, getattr(self, name), 0, 1e6)
+            check_range(name, getattr(self, name), 0, 1e6)
         for name in ("batch", "n_step", "actor_width", "critic_width", "delay"):
-            within(name, getattr(self, name), 1, 1_000_000)
-        within("critics", self.critics, 1, 2)
+            check_range(name, getattr(self, name), 1, 1_000_000)
+        check_range("critics", self.critics, 1, 2)
 
     @property
     def cost_window(self):

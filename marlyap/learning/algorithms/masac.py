@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from marlyap.errors import within
+from marlyap.errors import check_range
 from marlyap.learning.constraint import AbstractConstraint, Unconstrained
 from marlyap.learning.off_policy import AbstractOffPolicy
 from marlyap.learning.optimiser import TrainState, in_parts, parts, polyak
@@ -74,13 +74,13 @@ class MASAC(AbstractOffPolicy):
 
     def __check_init__(self):
         for name in ("gamma", "tau", "ema_rate"):
-            within(name, getattr(self, name), 0, 1, open=name != "gamma")
+            check_range(name, getattr(self, name), 0, 1, open=name != "gamma")
         for name in ("rate_pi", "rate_Q", "rate_alpha"):
-            within(name, getattr(self, name), 0, 1)
+            check_range(name, getattr(self, name), 0, 1)
         for name in ("alpha", "reward_scale"):
-            within(name, getattr(self, name), 0, 1e6, open=True)
+            check_range(name, getattr(self, name), 0, 1e6, open=True)
         for name in ("batch", "n_step", "actor_width", "critic_width"):
-            within(name, getattr(self, name), 1, 1_000_000)
+            check_range(name, getattr(self, name), 1, 1_000_000)
 
     @property
     def cost_window(self):

@@ -45,7 +45,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from marlyap.errors import UserError, within
+from marlyap.errors import UserError, check_range
 from marlyap.learning.constraint import AbstractConstraint
 from marlyap.learning.constraints.readings import READINGS, Terms, mean_over, rise
 from marlyap.learning.optimiser import TrainState, polyak
@@ -105,14 +105,14 @@ class Lyapunov(AbstractConstraint):
             raise UserError(f"reading: '{self.reading}' needs function {' or '.join(fit)}.")
         if self.function == "squares" and self.slope == "spectral":
             raise UserError("slope: 'spectral' needs function norm.")
-        within("horizon", self.horizon, 1, 10_000)
+        check_range("horizon", self.horizon, 1, 10_000)
         for name in ("discount", "decrease", "tau"):
-            within(name, getattr(self, name), 0, 1, open=name == "tau")
+            check_range(name, getattr(self, name), 0, 1, open=name == "tau")
         for name in ("weight_start", "floor", "input_gain"):
-            within(name, getattr(self, name), 0, 1e6, open=True)
+            check_range(name, getattr(self, name), 0, 1e6, open=True)
         for name in ("ball", "clip", "rate_L", "rate_weight", "weight", "slope"):
             if isinstance(value := getattr(self, name), float | int):
-                within(name, value, 0, 1e6)
+                check_range(name, value, 0, 1e6)
         if len(set(self.agents)) != len(self.agents):
             raise UserError(f"agents: {self.agents} names an agent twice.")
 
@@ -122,7 +122,7 @@ class Lyapunov(AbstractConstraint):
 
     def fits(self, agents):
         for i in self.agents:
-            within("--algorithm.constraint.agents", i, 0, agents - 1)
+            check_range("--algorithm.constraint.agents", i, 0, agents - 1)
 
     def paper(self):
         """The weight of Delta L is learnt; the paper does not have the reading `critic`."""
