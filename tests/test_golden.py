@@ -17,6 +17,8 @@ import pytest
 from marlyap.games.game import AbstractRegulation
 from marlyap.games.planar import Goals
 from marlyap.tasks import TASKS
+from marlyap.tasks.cartpoles import Row
+from marlyap.tasks.microgrid import Loads
 from marlyap.types import State
 
 
@@ -25,20 +27,30 @@ class Case(NamedTuple):
 
     task: str
     parts: Callable[[dict[str, Any]], tuple[Any, Any]]  # x and scenario of a state in the file
-    errors: Callable[[Any], Any] = lambda errors: errors  # the file's, from the game's
 
 
 def planar(start):
     return start["x"], Goals(start["goal"])
 
 
-def distances(errors):
-    return errors
+def cartpoles(start):
+    x = jnp.stack([start[name] for name in ("x", "v", "th", "w")], axis=-1)
+    one = jnp.ones((), x.dtype)
+    return x, Row(stiffness=one, push=0 * x[..., 0], begins=0 * one)
+
+
+def microgrid(start):
+    x, power = jnp.stack([start["V"], start["I"]], axis=-1), start["P"]
+    one = jnp.ones_like(power)
+    changes = jnp.zeros((), x.dtype)
+    return x, Loads(power=power, change=0 * one, changes=changes, line=one, capacitance=one)
 
 
 CASES = {
     "rendezvous-unicycle": Case("rendezvous", planar),
     "formation-unicycle": Case("formation", planar),
+    "cartpoles": Case("cartpoles", cartpoles),
+    "microgrid": Case("microgrid", microgrid),
 }
 
 

@@ -1,7 +1,9 @@
 """The tasks that can be asked for by name: configured objects, so a name is a preset."""
 
 from marlyap.games.dynamics import LateUnicycle, Unicycle
+from marlyap.tasks.cartpoles import CartPoles as CartPoles
 from marlyap.tasks.formation import Formation as Formation
+from marlyap.tasks.microgrid import Microgrid as Microgrid
 from marlyap.tasks.rendezvous import Rendezvous as Rendezvous
 
 
@@ -12,4 +14,6 @@ TASKS = {
     "rendezvous-late": Rendezvous(dynamics=LateUnicycle()),
     "rendezvous-rest": Rendezvous(rest_weight=0.03, horizon=60),
     "formation": Formation(),
+    "cartpoles": CartPoles(),
+    "microgrid": Microgrid(),
 }
