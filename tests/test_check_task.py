@@ -375,7 +375,7 @@ class CollisionEnds(Sound):
         return jnp.any(self.crowded(state, 0.4))
 
 
-@breaks("failure", "failure_cost: it is 0, and a step before a failure costs")
+@breaks("failure", "failure_cost: it is 0, and the steps before a failure cost")
 class FailureIsFree(Sound):
     def failed(self, state):
         return jnp.any(jnp.abs(self.positions(state)) > 1.05)

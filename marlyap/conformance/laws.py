@@ -745,16 +745,22 @@ def termination(probe: Probe) -> Faults:
 
 
 def failure(probe: Probe) -> Faults:
-    """A failure costs more than the steps before it, so that failing never pays."""
+    """A failure costs more than the steps before it, so that failing never pays.
+
+    The last LOOKAHEAD steps together: on the way to a failure, and back from where it threatens, a
+    cost may for an instant be larger than that of a failure, which lasts.
+    """
     played, game = probe.played, probe.game
     episode, time = np.nonzero(probe.running & played.failed)
     probe.figures["failed episodes"] = float(len(episode))
     if len(episode):
-        before = float(played.cost.mean(axis=2)[episode, time].max())
+        cost = played.cost.mean(axis=2)
+        ways = zip(episode, time, strict=True)
+        before = max(float(cost[e, max(0, t - LOOKAHEAD + 1) : t + 1].mean()) for e, t in ways)
         probe.figures |= {"cost before": before, "failure cost": float(game.failure_cost)}
         if not game.failure_cost >= before:
             yield (
-                f"failure_cost: it is {game.failure_cost:g}, and a step before a failure costs "
+                f"failure_cost: it is {game.failure_cost:g}, and the steps before a failure cost "
                 f"{before:.3g}, so that failing pays; make it the larger of the two."
             )
 

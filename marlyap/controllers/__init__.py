@@ -1,16 +1,23 @@
 """Controllers that are not learnt, to compare with: built in, or in a file of your own."""
 
+from marlyap.controllers.cart_feedback import CartFeedback as CartFeedback
+from marlyap.controllers.cart_lqr import CartLQR as CartLQR
 from marlyap.controllers.cascade import Cascade as Cascade
 from marlyap.controllers.controller import (
     AbstractController as AbstractController,
     as_action as as_action,
 )
 from marlyap.controllers.gradient import GradientConsensus as GradientConsensus
+from marlyap.controllers.grid_feedback import GridFeedback as GridFeedback
 from marlyap.controllers.lin_francis_maggiore import LinFrancisMaggiore as LinFrancisMaggiore
 from marlyap.controllers.optimal import OptimalControl as OptimalControl, Replayed as Replayed
 from marlyap.controllers.point_offset import PointOffset as PointOffset
 from marlyap.controllers.pursuit import TreePursuit as TreePursuit
-from marlyap.controllers.reference import UniformlyRandom as UniformlyRandom, Zero as Zero
+from marlyap.controllers.reference import (
+    Hold as Hold,
+    UniformlyRandom as UniformlyRandom,
+    Zero as Zero,
+)
 
 
 CONTROLLERS: dict[str, type[AbstractController]] = {
@@ -19,7 +26,11 @@ CONTROLLERS: dict[str, type[AbstractController]] = {
     "lin-francis-maggiore": LinFrancisMaggiore,
     "tree-pursuit": TreePursuit,
     "optimal-control": OptimalControl,
+    "cart-lqr": CartLQR,
+    "cart-feedback": CartFeedback,
+    "grid-feedback": GridFeedback,
     "zero": Zero,
+    "hold": Hold,
     "uniform": UniformlyRandom,
 }
 

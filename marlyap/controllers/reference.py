@@ -1,4 +1,4 @@
-"""No control and random control: the floor that every controller is compared with."""
+"""No control, feed-forward and random control: the floor that every controller is compared with."""
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,15 @@ class Zero(AbstractController):
 
     def __call__(self, state, key):
         return jnp.zeros((self.game.agents, self.game.du))
+
+
+class Hold(AbstractController):
+    """The action that would keep the target set, wherever the team is: feed-forward alone."""
+
+    game: AbstractGame
+
+    def __call__(self, state, key):
+        return self.game.hold(state)
 
 
 class UniformlyRandom(AbstractController):

@@ -91,6 +91,14 @@ class AbstractGame(eqx.Module):
         return 1.0
 
     @property
+    def edge_cost(self) -> float:
+        """What a step costs an agent at the edge of success: the scale of small costs.
+
+        Without a word of the game, `edge`, as if the cost were the distance.
+        """
+        return self.edge
+
+    @property
     def unit(self) -> str:
         """Of `distance` and `edge`; "tolerance" where distance counts in tolerances."""
         return "tolerance"

@@ -118,7 +118,7 @@ class Perturbed(AbstractRegulation):
         seed = branch(key, "perturb")
         for _ in range(depth(self.inner)):  # nested perturbations draw other numbers
             seed = jax.random.fold_in(seed, 3)
-        idle = self.inner.hold(start)
+        idle = self.driven.hold(start)
         queue = jnp.broadcast_to(idle, (self.delay, *idle.shape))
         memory = {"seed": jax.random.key_data(seed), "queue": queue, "inner": start.memory}
         return State(x=start.x, scenario=start.scenario, t=start.t, memory=memory)
@@ -168,6 +168,10 @@ class Perturbed(AbstractRegulation):
         return self.inner.edge
 
     @property
+    def edge_cost(self):
+        return self.inner.edge_cost
+
+    @property
     def unit(self):
         return self.inner.unit
 
@@ -187,7 +191,7 @@ class Perturbed(AbstractRegulation):
         return self.inner.error_entries()
 
     def hold(self, state):
-        return self.inner.hold(self.inside(state))
+        return self.driven.hold(self.inside(state))
 
     def at_target(self, state):
         return self.outside(self.inner.at_target(self.inside(state)), state)

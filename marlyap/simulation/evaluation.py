@@ -38,6 +38,7 @@ class Outcome(eqx.Module):
     settled: Scalar  # the time from which success lasts until the horizon (s); inf if it does not
     violated: Bool[Array, ""]  # an agent broke a rule at some step until the horizon
     total: Scalar  # return until the horizon: the undiscounted sum of the team's rewards
+    cost: Scalar  # the team's cost until the horizon, mean over the steps, failures charged
 
 
 def outcome(game: AbstractGame, trajectory: Trajectory) -> Outcome:
@@ -60,6 +61,7 @@ def outcome(game: AbstractGame, trajectory: Trajectory) -> Outcome:
         settled=jnp.where(lasts[-1] & sound, jnp.argmax(lasts) * game.dt, jnp.inf),
         violated=jnp.any(jax.vmap(game.violations)(seen.state)),
         total=jnp.sum(jnp.mean(seen.reward, axis=1)),
+        cost=jnp.mean(seen.cost),
     )
 
 
@@ -130,6 +132,7 @@ class Evaluation(eqx.Module):
     settled: Float[np.ndarray, "episode"]  # s; inf where it does not
     violated: Bool[np.ndarray, "episode"]  # a rule was broken until the horizon
     total: Float[np.ndarray, "episode"]  # return
+    cost: Float[np.ndarray, "episode"]  # of the team, mean over the steps, failures charged
     edge: float  # the distance up to which an agent counts as arrived (`unit`)
     unit: str
     mapped: bool  # whether the game has a map: speeds and spins mean something
@@ -160,7 +163,8 @@ class Evaluation(eqx.Module):
             | {"stayed": share(self.stayed, confidence), "beyond_steps": self.beyond}
             | {"violations": share(self.violated, confidence)}
             | {"final_distance": quantiles(self.final), "settling_time": quantiles(self.settled)}
-            | {"return_mean": float(np.mean(self.total)), "rests": self.rests()}
+            | {"return_mean": float(np.mean(self.total)), "cost_mean": float(np.mean(self.cost))}
+            | {"rests": self.rests()}
         )
         moving = {"final_speed": quantiles(self.speed), "final_spin": quantiles(self.spin)}
         rest = {"at_rest": share(self.at_rest, confidence)} | moving

@@ -155,6 +155,10 @@ class CartPoles(AbstractRegulation):
         return ~jnp.all((place <= self.most_place) & (angle <= self.most_angle))
 
     @property
+    def edge_cost(self):
+        return max(self.weights[0] * self.place**2, self.weights[2] * self.angle**2)
+
+    @property
     def failure_cost(self):
         return 10.0
 

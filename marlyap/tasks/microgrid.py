@@ -190,6 +190,10 @@ class Microgrid(AbstractRegulation):
         return ~jnp.all((V >= self.low) & (V <= self.high))
 
     @property
+    def edge_cost(self):
+        return self.weights[0] * self.near**2
+
+    @property
     def failure_cost(self):
         return 25.0
 

@@ -2,7 +2,7 @@
 
     symbol             here                            meaning
     mu_phi             pi, by its mode                 deterministic decentralised policies
-    l(c)               `sharp`                         c + sharpness c / (c + radius)
+    l(c)               `sharp`                         c + sharpness c / (c + edge cost)
     w_t                `weights`                       grow as t^2, and sum to 1
     J(phi)             J                               E_{s_0}[ sum_t w_t l(c_t) + l(c_H) ]
     Delta_t            `rise`                          max(0, c_{t+T} - (1 - decrease) c_t)
@@ -14,7 +14,7 @@ see no more than those of MASAC, but the trainer must have the equations of moti
 
 With `weight` > 0 the policy is also held to the paper's decrease condition in its finite-step form:
 with L(s_t) the sum of the next T costs, L(s_{t+1}) - L(s_t) = c_{t+T} - c_t, so Delta_t = 0 says
-that L falls by `decrease` c_t at s_t. It is asked for where c_t exceeds the radius (certificate C3
+that L falls by `decrease` c_t at s_t. It is asked for where c_t exceeds the cost at the edge of success (certificate C3
 tests the same).
 """
 
@@ -49,7 +49,7 @@ class APG(AbstractAlgorithm):
     rate_pi: float = 2e-3  # learning rate
     actor_width: int = 64  # units in each of two hidden layers
     shared: bool = False  # one set of actor weights for all agents
-    sharpness: float = 0.5  # extra cost of being outside the ball, beside the distance (m)
+    sharpness: float = 0.5  # extra cost of being beyond the edge of success, beside the cost
     clip: float = 1.0  # largest norm of a gradient
     ema_rate: float = 1e-2  # how fast the deployed policy follows the actor; 1 is the actor itself
     weight: float = 0.0  # of the decrease condition
@@ -95,18 +95,18 @@ class APG(AbstractAlgorithm):
         ended = jnp.concatenate([jnp.zeros(1, bool), path.terminated])  # at s_0 ... s_H
         end = charged(game, last, game.hold(last))[0]
         cost = jnp.where(ended[:, None], 0.0, jnp.concatenate([path.cost, end[None]]))
-        sharp = lambda c: jnp.mean(c + self.sharpness * c / (c + game.edge), axis=-1)
+        sharp = lambda c: jnp.mean(c + self.sharpness * c / (c + game.edge_cost), axis=-1)
         weights = jnp.arange(1, game.horizon + 1) ** 2.0
         J = jnp.sum(weights / jnp.sum(weights) * sharp(cost[:-1])) + sharp(cost[-1])
         J = J + self.weight * self.rise(jnp.mean(cost, axis=1), game)
         return J, (path.cost, path.reward)
 
     def rise(self, c: Float[Array, "time"], game: AbstractGame) -> Scalar:
-        """The mean over t of Delta_t, where the team's cost c_t exceeds the radius."""
+        """The mean over t of Delta_t, where the team's cost c_t exceeds that at the edge of success."""
         T = min(self.T, c.shape[0] - 1)
         now, ahead = c[:-T], c[T:]
         delta = jax.nn.relu(ahead - (1 - self.decrease) * now)
-        return jnp.mean(jnp.where(now >= game.edge, delta, 0.0))
+        return jnp.mean(jnp.where(now >= game.edge_cost, delta, 0.0))
 
     def improve(
         self, networks: Networks, game: AbstractGame, keys: Keys, decay: Scalar
