@@ -25,7 +25,7 @@ from common import (
 from headline import cases
 
 from marlyap import statistics
-from marlyap.certificates.robustness import moved
+from marlyap.certificates.loop import seen_through
 from marlyap.controllers import CONTROLLERS
 from marlyap.games.perturbed import Perturbed, edge_to_cut, follower_to_lose, traced
 from marlyap.runs.provenance import provenance
@@ -89,7 +89,7 @@ def table(args):
         for kind, level, other in perturbed(game, args.quick):
             key = (args.task, algorithm, seed, kind, level)
             if tuple(map(str, key)) not in there:
-                found, _ = measure(other, moved(controller, other), args.episodes)
+                found, _ = measure(other, seen_through(other, controller), args.episodes)
                 about = dict(zip(COLUMNS, key, strict=True)) | {"radius": RADIUS}
                 made = after(found) | {"policy": policy_hash(controller)} | provenance()
                 put(args, name, COLUMNS, [about | counted(found.final <= RADIUS) | made])

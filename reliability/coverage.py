@@ -30,10 +30,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from marlyap.certificates.basin import Basin
-from marlyap.certificates.certificate import AbstractCertificate, Found, Verdict, judged
+from marlyap.certificates.certificate import AbstractCertificate, Draw, Found, Verdict, judged
 from marlyap.certificates.composition import Composition, _Windows, worst_excess
 from marlyap.certificates.contraction import Contraction, rates
 from marlyap.certificates.decrease import Decrease
+from marlyap.certificates.loop import ClosedLoop
 from marlyap.certificates.lyapunov import CostSum
 from marlyap.certificates.quantiles import NAMES, Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
@@ -257,7 +258,7 @@ KINDS: dict[str, AbstractCertificate] = {
 
 def seen(judge: Any, steps: int, rollouts: int, game: AbstractPlanar = GAME) -> Found:
     """What a certificate's judge makes of very many rollouts."""
-    return judged(judge, game, IDLE, V, TRUTH, "certify", rollouts, steps)
+    return judged(judge, ClosedLoop(game, IDLE, V), Draw(TRUTH, "certify", rollouts), steps)
 
 
 def truths(rollouts: int) -> dict[str, Callable[[Verdict], bool]]:
@@ -327,7 +328,7 @@ def certificates(quick: bool) -> list[dict[str, Any]]:
     true, rows = truths(rollouts), []
     for name, certificate in KINDS.items():
         game = COMING if name in ("basin", "composition") else GAME
-        verdicts = [certificate.check(game, IDLE, V, seed) for seed in range(count)]
+        verdicts = [certificate.check(ClosedLoop(game, IDLE, V), seed) for seed in range(count)]
         claims = [v for v in verdicts if v.bound is not None]  # others claim nothing
         wrong = sum(not true[name](v) for v in claims)
         about = {"kind": name, "certificates": count, "claims": len(claims)}

@@ -26,6 +26,7 @@ from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
 from marlyap.certificates.information import information
 from marlyap.certificates.linearisation import Linearisation
+from marlyap.certificates.loop import ClosedLoop
 from marlyap.certificates.lyapunov import Approach, CostSum, Norm, Quadratic, cost_sum
 from marlyap.certificates.proof import Loop, Proof, extents, halves, lyapunov
 from marlyap.certificates.quantiles import Quantiles
@@ -420,14 +421,16 @@ class Near(Flow):
 def test_composition_of_what_grows_is_refused(growth, start):
     """From starts inside their own bound the inequalities hold for a while, and say nothing."""
     game = Near(growth * jnp.eye(2), jnp.asarray(0.0), start=start)
-    verdict = Composition(rollouts=N, calibration=N).check(game, Idle(), Quadratic(jnp.eye(2)), 0)
+    verdict = Composition(rollouts=N, calibration=N).check(
+        ClosedLoop(game, Idle(), Quadratic(jnp.eye(2))), 0
+    )
     assert not verdict.holds and verdict.claim.startswith("nothing was contracted")
     assert verdict.bound is None and sentence(verdict).endswith(": does not hold.")
 
 
 def test_composition_says_until_when():
     verdict = Composition(rollouts=N, calibration=N).check(
-        flow([[0.8, 0.0], [0.0, 0.8]]), Idle(), Quadratic(jnp.eye(2)), 0
+        ClosedLoop(flow([[0.8, 0.0], [0.0, 0.8]]), Idle(), Quadratic(jnp.eye(2))), 0
     )
     assert verdict.holds and "until step 90 (9 s)" in verdict.claim
     assert verdict.figures["begin_above"] > N / 2 and np.any(verdict.figures["M"])
@@ -458,7 +461,7 @@ def test_a_verdict_on_nothing_does_not_hold():
     """Starts inside the ball and an unstable plant: no transition and no window to judge."""
     game = Near(1.02 * jnp.eye(2), jnp.asarray(0.0), start=0.02)
     for certificate in (TABLE["decrease"], TABLE["contraction"]):
-        verdict = certificate.check(game, Idle(), Quadratic(jnp.eye(2)), 0)
+        verdict = certificate.check(ClosedLoop(game, Idle(), Quadratic(jnp.eye(2))), 0)
         assert not verdict.holds and verdict.claim.startswith("nothing to judge: 0 of 600")
         assert verdict.trials == verdict.bound == 0
 
@@ -466,7 +469,7 @@ def test_a_verdict_on_nothing_does_not_hold():
 def test_trials_are_what_leaves_something_to_judge():
     """Half of the starts lie inside the ball; of them a decrease says nothing."""
     game = Near(0.8 * jnp.eye(2), jnp.asarray(0.0), start=0.15)
-    verdict = TABLE["decrease"].check(game, Idle(), Quadratic(jnp.eye(2)), 0)
+    verdict = TABLE["decrease"].check(ClosedLoop(game, Idle(), Quadratic(jnp.eye(2))), 0)
     outside = 1 - np.pi * 0.1**2 / 0.3**2
     assert verdict.holds and verdict.trials == pytest.approx(outside * N, rel=0.1)
     assert verdict.figures["drawn"] == N
@@ -474,7 +477,7 @@ def test_trials_are_what_leaves_something_to_judge():
 
 def test_growth_is_not_called_contraction():
     game = flow([[1.05, 0.0], [0.0, 1.05]])
-    verdict = TABLE["contraction"].check(game, Idle(), Quadratic(jnp.eye(2)), 0)
+    verdict = TABLE["contraction"].check(ClosedLoop(game, Idle(), Quadratic(jnp.eye(2))), 0)
     assert not verdict.holds and verdict.figures["beta"] == pytest.approx(1 - 1.05**20, rel=1e-3)
     assert verdict.claim.startswith("the cost does not contract") and "grows by" in verdict.claim
     assert verdict.bound > 0.95 and sentence(verdict).endswith(": does not hold.")
@@ -482,11 +485,11 @@ def test_growth_is_not_called_contraction():
 
 def test_an_infinite_bound_reads_unbounded():
     verdict = TABLE["quantiles"].check(
-        flow([[1.0, 0.0], [0.0, 1.0]]), Idle(), Quadratic(jnp.eye(2)), 0
+        ClosedLoop(flow([[1.0, 0.0], [0.0, 1.0]]), Idle(), Quadratic(jnp.eye(2))), 0
     )
     assert "settling time unbounded;" in verdict.claim and not verdict.holds
     bounds = {"final_distance": 0.04121, "settling_time": 3.8, "largest_rise": np.inf}
-    said = quantiles.claim(0.95, bounds, "a form", 40, 0.1)
+    said = quantiles.claim(0.95, bounds, "a form", "m", "until step 40 (4 s)")
     assert "final distance at most 0.04121 m; settling time at most 3.8 s" in said
     assert "largest rise unbounded of V" in said
     assert quantiles.at_most(0.123401) == "at most 0.1235"  # an upper bound is rounded up
@@ -499,14 +502,14 @@ def test_perturbations_that_cannot_be_applied_are_named():
 
     few = Robustness(400, (0.5,), (), (), (), (), share=0.9)
     game = Judged(agents=2, graph="path", dynamics=SingleIntegrator())
-    verdict = few.check(game, lambda s, k: s.scenario.goal - s.x, CostSum(Idle()), 0)
+    verdict = few.check(ClosedLoop(game, lambda s, k: s.scenario.goal - s.x, CostSum(Idle())), 0)
     assert "without agent 1" in verdict.figures["without"]
     assert "(left out: without agent 1, because an agent of Judged" in verdict.claim
     assert (
         "without agent" not in verdict.scope["disturbance"] and len(verdict.figures["curve"]) == 2
     )
     with pytest.raises(UserError, match="gain 0.5, because the inputs of this game"):
-        few.check(flow([[0.8, 0.0], [0.0, 0.8]]), Idle(), CostSum(Idle()), 0)
+        few.check(ClosedLoop(flow([[0.8, 0.0], [0.0, 0.8]]), Idle(), CostSum(Idle())), 0)
 
 
 def test_composition_fits_a_known_row():
@@ -521,7 +524,7 @@ def test_composition_fits_a_known_row():
 def test_closed_form_of_a_path_of_two():
     game = Rendezvous(agents=2, graph="path")
     law = PointOffset(game, offset=0.1, leader_gain=1.0, k_p=4.0, k_d=4.0)
-    verdict = ClosedForm().check(game, law, CostSum(law), 0)
+    verdict = ClosedForm().check(ClosedLoop(game, law, CostSum(law)), 0)
     assert np.allclose(verdict.figures["eigenvalues"], 1 - np.array([1, -1]) / 2**0.5)
     roots = np.roots([1.0, 4.0, 4.0 * (1 - 1 / 2**0.5)])
     assert verdict.holds and verdict.bound == pytest.approx(-max(roots.real))
@@ -529,19 +532,19 @@ def test_closed_form_of_a_path_of_two():
         A = np.array([[0.0, 1.0], [-4.0 * mu, -4.0]])
         assert np.allclose(A.T @ P + np.array(P) @ A, -np.eye(2))
     unstable = PointOffset(game, k_p=4.0, k_d=-1.0)
-    assert not ClosedForm().check(game, unstable, CostSum(law), 0).holds
+    assert not ClosedForm().check(ClosedLoop(game, unstable, CostSum(law)), 0).holds
     with pytest.raises(UserError, match="PointOffset"):
-        ClosedForm().check(game, Idle(), CostSum(law), 0)
+        ClosedForm().check(ClosedLoop(game, Idle(), CostSum(law)), 0)
 
 
 def test_the_linearisation_says_no_to_the_unicycle():
     game = Rendezvous(agents=1)
-    verdict = Linearisation().check(game, Idle(), CostSum(Idle()), 0)
+    verdict = Linearisation().check(ClosedLoop(game, Idle(), CostSum(Idle())), 0)
     assert not verdict.holds and verdict.figures["controllability_rank"] == 4
     assert verdict.claim.startswith("NO") and verdict.evidence == "proved"
     assert verdict.figures["uncontrollable_eigenvalues"] == pytest.approx([1.0])
-    assert Linearisation().check(POINT, Scripted(), CostSum(Idle()), 0).holds
-    assert not Linearisation().check(POINT, Idle(), CostSum(Idle()), 0).holds
+    assert Linearisation().check(ClosedLoop(POINT, Scripted(), CostSum(Idle())), 0).holds
+    assert not Linearisation().check(ClosedLoop(POINT, Idle(), CostSum(Idle())), 0).holds
 
 
 class Holonomic(Rendezvous):
@@ -561,7 +564,7 @@ class Holonomic(Rendezvous):
 
 
 def test_the_linearisation_is_of_the_games_own_step():
-    verdict = Linearisation().check(Holonomic(agents=1), Idle(), CostSum(Idle()), 0)
+    verdict = Linearisation().check(ClosedLoop(Holonomic(agents=1), Idle(), CostSum(Idle())), 0)
     assert verdict.evidence == "observed" and verdict.holds
     assert verdict.bound == pytest.approx(0.6, abs=1e-12)
 
@@ -569,15 +572,21 @@ def test_the_linearisation_is_of_the_games_own_step():
 @pytest.mark.parametrize("A, fine", [(0.99, True), (0.9995, False), (0.99999994, False),
                                      (1.0, False), (1.00001, False)])  # fmt: skip
 def test_the_linearisation_keeps_a_margin(A, fine):
-    verdict = Linearisation().check(flow([[A, 0.0], [0.0, A]]), Idle(), CostSum(Idle()), 0)
+    verdict = Linearisation().check(
+        ClosedLoop(flow([[A, 0.0], [0.0, A]]), Idle(), CostSum(Idle())), 0
+    )
     assert verdict.holds == fine
 
 
 def test_the_linearisation_asks_for_an_equilibrium_that_does_not_move():
-    beside = Linearisation().check(POINT, Straying(jnp.asarray(0.05)), CostSum(Idle()), 0)
+    beside = Linearisation().check(
+        ClosedLoop(POINT, Straying(jnp.asarray(0.05)), CostSum(Idle())), 0
+    )
     assert not beside.holds and beside.claim.startswith("the goal is no equilibrium: on it the")
     assert "agents move by 0.04 in a step" in beside.claim
-    late = Linearisation().check(POINT, Scripted(leave=jnp.asarray(45)), CostSum(Idle()), 0)
+    late = Linearisation().check(
+        ClosedLoop(POINT, Scripted(leave=jnp.asarray(45)), CostSum(Idle())), 0
+    )
     assert not late.holds and "depends on the time" in late.claim
 
     class Drifting(Flow):
@@ -586,10 +595,10 @@ def test_the_linearisation_asks_for_an_equilibrium_that_does_not_move():
             return eqx.tree_at(lambda s: s.x, after, after.x + 0.01)
 
     moving = Drifting(jnp.eye(2) * 0.5, jnp.asarray(0.0))
-    verdict = Linearisation().check(moving, Idle(), CostSum(Idle()), 0)
+    verdict = Linearisation().check(ClosedLoop(moving, Idle(), CostSum(Idle())), 0)
     assert not verdict.holds and "under the holding action the agents move" in verdict.claim
     kinked = lambda state, key: -3.0 * jnp.abs(state.x - state.scenario.goal)
-    verdict = Linearisation().check(POINT, kinked, CostSum(Idle()), 0)
+    verdict = Linearisation().check(ClosedLoop(POINT, kinked, CostSum(Idle())), 0)
     assert not verdict.holds and "no derivative" in verdict.claim
 
 
@@ -613,7 +622,9 @@ class Meeting(Flow):
 def test_an_eigenvalue_along_the_target_set_is_harmless():
     """No input moves the mean of the two, and no error sees it: nothing is impossible."""
     game = Meeting(jnp.eye(2), jnp.asarray(0.0))
-    verdict = Linearisation().check(game, lambda s, k: -(s.x - s.scenario.goal), CostSum(Idle()), 0)
+    verdict = Linearisation().check(
+        ClosedLoop(game, lambda s, k: -(s.x - s.scenario.goal), CostSum(Idle())), 0
+    )
     assert verdict.figures["controllability_rank"] == 2 and not verdict.holds
     assert verdict.figures["uncontrollable_eigenvalues"] == []
     assert verdict.evidence == "observed" and "no stability is shown" in verdict.claim
@@ -626,15 +637,15 @@ def test_formulas_are_about_their_own_model_only():
 
     one, law = Sticky(agents=1), PointOffset(Sticky(agents=1))
     with pytest.raises(UserError, match="Sticky has another `step`"):
-        ClosedForm().check(one, law, CostSum(law), 0)
+        ClosedForm().check(ClosedLoop(one, law, CostSum(law)), 0)
     policy = Decentralised(
         policy_of(GAINS)[1].policy, Sticky(agents=1, dynamics=DoubleIntegrator())
     )
     with pytest.raises(UserError, match="another `step`"):
-        ANNULUS.check(policy.game, policy, FORM, 0)
+        ANNULUS.check(ClosedLoop(policy.game, policy, FORM), 0)
     other = Rendezvous(agents=1, dynamics=Unicycle(limits=(1.0, 1.0)))
     with pytest.raises(UserError, match="made for another game"):
-        ClosedForm().check(Rendezvous(agents=1), PointOffset(other), CostSum(law), 0)
+        ClosedForm().check(ClosedLoop(Rendezvous(agents=1), PointOffset(other), CostSum(law)), 0)
 
     class Slippery(DoubleIntegrator):
         def step(self, x, action, dt):
@@ -642,14 +653,14 @@ def test_formulas_are_about_their_own_model_only():
 
     with pytest.raises(UserError, match="not Slippery"):
         game = Rendezvous(agents=1, dynamics=Slippery())
-        ANNULUS.check(game, Decentralised(policy.policy, game), FORM, 0)
+        ANNULUS.check(ClosedLoop(game, Decentralised(policy.policy, game), FORM), 0)
 
 
 def test_a_proof_about_nothing_is_refused():
     game, stable = policy_of(GAINS)
     for wrong in (dict(c=1e6, rho=1e5, inner=1e5), dict(eta=-1.0), dict(eta=0.0)):
         with pytest.raises(UserError, match="nothing to prove|V must fall"):
-            dataclasses.replace(ANNULUS, **wrong).check(game, stable, FORM, 0)
+            dataclasses.replace(ANNULUS, **wrong).check(ClosedLoop(game, stable, FORM), 0)
 
 
 def test_split_boxes_overlap_however_far_out():
@@ -683,18 +694,18 @@ ANNULUS = Proof(c=1.0, rho=0.7, inner=0.7, half=(0.31, 0.31, 0.8, 0.8), eta=1e-4
 
 def test_a_proof_succeeds_resumes_and_refutes(tmp_path):
     game, stable = policy_of(GAINS)
-    assert ANNULUS.check(game, stable, FORM, 0).figures["answer"] == "proved"
+    assert ANNULUS.check(ClosedLoop(game, stable, FORM), 0).figures["answer"] == "proved"
     place = str(tmp_path / "proof")
     short = dataclasses.replace(ANNULUS, most=5_000, resume=place)
-    verdict = short.check(game, stable, FORM, 0)
+    verdict = short.check(ClosedLoop(game, stable, FORM), 0)
     assert not verdict.holds and verdict.figures["answer"] == "undecided"
     assert 0 < verdict.figures["volume_left"] <= 1
-    assert dataclasses.replace(short, most=10**6).check(game, stable, FORM, 0).holds
+    assert dataclasses.replace(short, most=10**6).check(ClosedLoop(game, stable, FORM), 0).holds
     for K in (-GAINS, 0 * GAINS):  # unstable and marginal
-        verdict = ANNULUS.check(*policy_of(K), FORM, 0)
+        verdict = ANNULUS.check(ClosedLoop(*policy_of(K), FORM), 0)
         assert verdict.figures["answer"] == "refuted" and verdict.worst["V_next"] > 0
     with pytest.raises(UserError, match="another proof"):
-        short.check(*policy_of(-GAINS), FORM, 0)
+        short.check(ClosedLoop(*policy_of(-GAINS), FORM), 0)
 
 
 APPROACH = Approach(
@@ -729,7 +740,7 @@ def test_the_bounds_of_the_unicycle_hold_at_random_points(kind):
     rng = np.random.default_rng(0)
     centre, radius = rng.uniform(-1, 1, (500, 4)), rng.uniform(0, 0.2, (500, 4))
     box = bounds.box(centre, radius)
-    moved, V_of = Loop(game, controller)(box), lyapunov(V, game.radius)
+    moved, V_of = Loop(ClosedLoop(game, controller, V))(box), lyapunov(V, game.radius)
     before, after = V_of(box), V_of(moved)
     change = bounds.add(after, before, -1.0)
 
@@ -766,9 +777,11 @@ def steady(state, key):
 def test_safe_counts_rollouts_in_which_a_rule_is_broken():
     points = dict(agents=2, leaders=(0, 1), dynamics=SingleIntegrator((2.0, 2.0)))
     few = Safe(rollouts=N, share=0.8)
-    meets = few.check(Rules(**points), lambda s, k: s.scenario.goal - s.x, CostSum(Idle()), 0)
+    meets = few.check(
+        ClosedLoop(Rules(**points), lambda s, k: s.scenario.goal - s.x, CostSum(Idle())), 0
+    )
     assert not meets.holds and meets.successes == 0 and meets.worst["failed"]
-    still = few.check(Rules(**points, gap=0.2), steady, CostSum(Idle()), 0)
+    still = few.check(ClosedLoop(Rules(**points, gap=0.2), steady, CostSum(Idle())), 0)
     # Two points uniform in a square of side 2 are closer than r with probability pi r^2 / 4, less
     # what lies outside.
     assert still.holds and still.successes / N == pytest.approx(1 - 0.0293, abs=0.02)
@@ -777,9 +790,9 @@ def test_safe_counts_rollouts_in_which_a_rule_is_broken():
 
 def test_safe_refuses_a_game_without_a_rule():
     with pytest.raises(UserError, match="Rendezvous has no rule to break"):
-        Safe().check(POINT, Scripted(), CostSum(Idle()), 0)
+        Safe().check(ClosedLoop(POINT, Scripted(), CostSum(Idle())), 0)
     with pytest.raises(UserError, match="Formation never fire"):
-        Safe().check(Formation(), Scripted(), CostSum(Idle()), 0)
+        Safe().check(ClosedLoop(Formation(), Scripted(), CostSum(Idle())), 0)
     result = certified(POINT, Scripted(), {"reach": TABLE["reach"], "safe": Safe()})
     assert "no rule to break" in result["left_out"]["safe"] and not result["holds"]
 
@@ -787,16 +800,16 @@ def test_safe_refuses_a_game_without_a_rule():
 def test_apart_finds_the_gap_and_tests_it_on_fresh_starts():
     points = dict(agents=2, leaders=(0, 1), dynamics=SingleIntegrator((2.0, 2.0)))
     verdict = Apart(rollouts=N, calibration=N, share=0.8).check(
-        Rules(**points), steady, CostSum(Idle()), 0
+        ClosedLoop(Rules(**points), steady, CostSum(Idle())), 0
     )
     gap = verdict.figures["gap"]
     assert verdict.holds and 0.3 < gap < 0.6 and f"closer than {gap:g} m" in verdict.claim
     meets = Apart(rollouts=N, calibration=N).check(
-        Rules(**points), lambda s, k: s.scenario.goal - s.x, CostSum(Idle()), 0
+        ClosedLoop(Rules(**points), lambda s, k: s.scenario.goal - s.x, CostSum(Idle())), 0
     )
     assert not meets.holds and "less than the 0.01 m asked" in meets.claim
     with pytest.raises(UserError, match="team of one"):
-        Apart().check(POINT, Scripted(), CostSum(Idle()), 0)
+        Apart().check(ClosedLoop(POINT, Scripted(), CostSum(Idle())), 0)
 
 
 PATH = Rendezvous(graph="path", dynamics=SingleIntegrator())  # 0 leads, 2 is linked to 1 alone

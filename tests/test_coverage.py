@@ -78,7 +78,9 @@ def test_a_certificate_that_claims_its_own_estimate_is_found_out(coverage):
     """Without a margin a claimed share is too high half of the time."""
     reach = coverage.KINDS["reach"]
     true = coverage.seen(reach.judge, coverage.GAME.horizon, 20_000).holds.mean()
-    check = lambda seed: reach.check(coverage.GAME, coverage.IDLE, coverage.V, seed)
+    check = lambda seed: reach.check(
+        coverage.ClosedLoop(coverage.GAME, coverage.IDLE, coverage.V), seed
+    )
     verdicts = [check(seed) for seed in range(60)]
     assert coverage.above(sum(v.successes / v.trials > true for v in verdicts), 60, 0.1)
 

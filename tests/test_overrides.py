@@ -19,6 +19,7 @@ from marlyap.certificates.composition import _Windows
 from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
 from marlyap.certificates.linearisation import Linearisation
+from marlyap.certificates.loop import ClosedLoop
 from marlyap.certificates.lyapunov import AbstractLyapunov, CostSum
 from marlyap.certificates.proof import Proof
 from marlyap.certificates.quantiles import Quantiles
@@ -334,12 +335,12 @@ def test_certificates_judge_what_the_game_says(oracle):
 @pytest.mark.parametrize("certificate", (ClosedForm(), PROOF), ids=("closed-form", "proof"))
 def test_formulas_refuse_a_game_with_methods_of_its_own(certificate):
     with pytest.raises(UserError):
-        certificate.check(GAME, LAW, Rising(), 0)
+        certificate.check(ClosedLoop(GAME, LAW, Rising()), 0)
 
 
 def test_the_linearisation_is_that_of_the_games_own_step():
     """x+ = 0.95 (x + dt a) with a = 1.5 (goal - x): the target is no equilibrium of that."""
-    verdict = Linearisation().check(GAME, LAW, Rising(), 0)
+    verdict = Linearisation().check(ClosedLoop(GAME, LAW, Rising()), 0)
     assert not verdict.holds and "no equilibrium" in verdict.claim
 
 

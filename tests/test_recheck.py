@@ -23,10 +23,11 @@ from marlyap.certificates.composition import Composition
 from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
 from marlyap.certificates.linearisation import Linearisation
+from marlyap.certificates.loop import seen_through
 from marlyap.certificates.lyapunov import Norm, Quadratic
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
-from marlyap.certificates.robustness import Robustness, moved
+from marlyap.certificates.robustness import Robustness
 from marlyap.certificates.safety import Apart, Safe
 from marlyap.certificates.theorem1 import Theorem1
 from marlyap.cli import main
@@ -824,7 +825,7 @@ def test_its_world_is_the_same(dynamics, kind, change):
     net = NormNet(shape(nominal), key=jax.random.key(3))
     V = Norm(net) if kind == "norm" else Quadratic(jnp.eye(errors) + 0.1)
     start = start_of(game, 7, "certify", 2)
-    driver = moved(controller, game) if change else controller
+    driver = seen_through(game, controller)
     seen = eqx.filter_jit(rollout)(game, driver, start, jax.random.key(5), 15)
     sim = of(nominal, controller, V)
     found = sim.roll(3, 15, change)

@@ -7,6 +7,8 @@ import numpy as np
 
 from marlyap.certificates.certificate import (
     AbstractCertificate,
+    Claim,
+    Draw,
     Evidence,
     Judgement,
     arrival,
@@ -58,11 +60,12 @@ class Basin(AbstractCertificate):
     evidence: ClassVar[Evidence] = "statistical"
     asks_V: ClassVar[bool] = True
 
-    def check(self, game, controller, V, seed):
-        steps, n = game.horizon + max(self.stay, V.beyond), self.rollouts
+    def check(self, loop, seed):
+        game, V, n = loop.game, loop.V, self.rollouts
+        steps = game.horizon + max(self.stay, V.beyond)
         each = bonferroni(self.confidence, 2)
-        draw = lambda purpose, count: judged(
-            self.judge, game, controller, V, seed, purpose, count, steps, True
+        draw = lambda purpose, n: judged(
+            self.judge, loop, Draw(seed, purpose, n), steps, uses_V=True
         )
         first, found = draw("calibrate", self.calibration), draw("certify", n)
         level = largest_level(first.figures["V"], first.holds)
@@ -79,17 +82,12 @@ class Basin(AbstractCertificate):
             game.dt,
             float(mass.low),
         )
-        return of_share(
-            self,
-            game,
-            V,
-            seed,
-            found,
-            game.horizon + self.stay,
+        what = Claim(
+            "basin",
             say,
-            name="basin",
+            game.horizon + self.stay,
             confidence=each,
-            void=no_lyapunov(V, first, found),
+            void=no_lyapunov(first, found),
             to_judge=f"begin with V <= {level:.4g}, below the least V of a failure",
             scope={"starts_with": f"V <= {level:.6g}"},
             figures={
@@ -101,6 +99,7 @@ class Basin(AbstractCertificate):
                 "failures_calibrating": int((~first.holds).sum()),
             },
         )
+        return of_share(self, loop, seed, found, what)
 
     def judge(self, game, V, trajectory, key):
         seen = until(trajectory, game.horizon + self.stay)

@@ -9,7 +9,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from marlyap.certificates.lyapunov import AbstractLyapunov
+from marlyap.certificates.loop import ClosedLoop
+from marlyap.certificates.lyapunov import AbstractLyapunov, measured as measured
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame, AbstractRegulation
 from marlyap.games.perturbed import Perturbed
@@ -113,17 +114,39 @@ class AbstractCertificate(eqx.Module):
     evidence: eqx.AbstractClassVar[Evidence]
     asks_V: ClassVar[bool] = False  # whether V is part of what is claimed
 
-    def refuse(self, game: AbstractRegulation, controller: Controller, V: AbstractLyapunov) -> None:
+    def refuse(self, loop: ClosedLoop) -> None:
         """Raise UserError where this certificate is not about such a game, controller or V."""
 
     @abc.abstractmethod
-    def check(
-        self, game: AbstractRegulation, controller: Controller, V: AbstractLyapunov, seed: int
-    ) -> Verdict:
+    def check(self, loop: ClosedLoop, seed: int) -> Verdict:
         """Judge one controller. It does not raise when the controller fails.
 
         Raises UserError as `refuse` does, and for fields that cannot show what is asked.
         """
+
+
+class Draw(NamedTuple):
+    """Which rollouts: the seed, the stream of it, and how many."""
+
+    seed: int
+    purpose: Purpose
+    rollouts: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Claim:
+    """What is claimed of a share of the trials, before that share is bounded."""
+
+    name: str
+    say: Callable[[float], str]  # the sentence, given the bound
+    steps: int  # how far a rollout is judged
+    to_judge: str = "leave something to judge"  # what a trial does, in words
+    confidence: float | None = None  # of this bound, where it is not the certificate's
+    void: str | None = None  # why nothing can be bounded, if so
+    also: bool = True  # what else has to be true for the claim to hold
+    evidence: Evidence = "statistical"
+    scope: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # to be added
+    figures: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # to be added
 
 
 # The key is for what a certificate draws itself, such as one time of the rollout.
@@ -170,31 +193,22 @@ def _judge(
     return jax.vmap(one)(seen, indices)
 
 
-def judged(
-    judge: Judge,
-    game: AbstractRegulation,
-    controller: Controller,
-    V: AbstractLyapunov,
-    seed: int,
-    purpose: Purpose,
-    count: int,
-    steps: int,
-    uses_V: bool = False,
-) -> Found:
-    """`judge` of `count` rollouts of `steps` steps, as NumPy arrays.
+def judged(judge: Judge, loop: ClosedLoop, draw: Draw, steps: int, uses_V: bool = False) -> Found:
+    """`judge` of the rollouts of a draw, each of `steps` steps, as NumPy arrays.
 
     With `uses_V` V is also held to V >= 0 in every state of every rollout (`Found.negative`).
 
-    They are rolled in chunks, so that memory does not grow with `count`, and for a whole number of
-    horizons, so that certificates share what was compiled; the judge sees `steps` steps of it.
+    They are rolled in chunks, so that memory does not grow with their number, and for a whole
+    number of horizons, so that certificates share what was compiled; the judge sees `steps` steps.
     """
+    game, (seed, purpose, count) = loop.game, draw
     long = math.ceil(steps / game.horizon) * game.horizon
     size = max(1, min(count, 1000, CHUNK // (game.agents * (long + 1))))
     key, parts = stream(seed, purpose), []
     for first in range(0, count, size):
         indices = np.arange(first, first + size)
-        seen = _roll(game, controller, key, indices, long)
-        found = _judge(judge, game, V, seen, key, indices, steps, uses_V)
+        seen = _roll(game, loop.controller, key, indices, long)
+        found = _judge(judge, game, loop.V, seen, key, indices, steps, uses_V)
         parts.append(jax.tree.map(np.asarray, found))
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
     return Found(**joined)
@@ -268,7 +282,7 @@ def passing(values: np.ndarray, rollouts: int, share: float, confidence: float) 
     return float(np.sort(values)[int(allowed * len(values))])
 
 
-def no_lyapunov(V: AbstractLyapunov, *founds: Found) -> str | None:
+def no_lyapunov(*founds: Found) -> str | None:
     """One sentence if V was negative somewhere, which no Lyapunov function is; else None."""
     negative, drawn = sum(f.negative for f in founds), sum(len(f.holds) for f in founds)
     if not negative:
@@ -276,55 +290,37 @@ def no_lyapunov(V: AbstractLyapunov, *founds: Found) -> str | None:
     return f"V is negative at {negative} of {drawn} rollouts, so it is no Lyapunov function"
 
 
-def of_share(
-    certificate: Any,
-    game: AbstractRegulation,
-    V: AbstractLyapunov,
-    seed: int,
-    found: Found,
-    steps: int,
-    claim: Callable[[float], str],
-    *,
-    name: str,
-    confidence: float | None = None,
-    void: str | None = None,
-    also: bool = True,
-    to_judge: str = "leave something to judge",
-    evidence: Evidence = "statistical",
-    scope: Mapping[str, Any] | None = None,
-    figures: Mapping[str, Any] | None = None,
-) -> Verdict:
+def of_share(certificate: Any, loop: ClosedLoop, seed: int, found: Found, claim: Claim) -> Verdict:
     """The verdict that a share of the trials holds: bound, exact, at the share asked for.
 
     The trials are the rollouts that leave something to judge. Where they are too few for the share
-    that is the claim instead of `claim(bound)`. So is a negative V, or the reason that `void` has:
-    then nothing is bounded, and the bound is None. `also` has to be true for it to hold.
+    that is said instead of the claim. So is a negative V, or the reason that the claim is void:
+    then nothing is bounded, and the bound is None.
 
-    Arguments: certificate, with fields share and confidence; confidence, of this bound, where it is
-    not the certificate's; to_judge, what a trial does, in words; scope and figures, to be added.
+    Arguments: certificate, with fields share and confidence; seed, of the rollouts found.
     """
-    each = certificate.confidence if confidence is None else confidence
+    each = certificate.confidence if claim.confidence is None else claim.confidence
     n, k = int(found.asked.sum()), int((found.holds & found.asked).sum())
     bound, shown = at_least(k, n, certificate.share, each)
-    void = void or no_lyapunov(V, found)
-    needed, said = trials_needed(1.0 - certificate.share, each), void or claim(bound)
+    void = claim.void or no_lyapunov(found)
+    needed, said = trials_needed(1.0 - certificate.share, each), void or claim.say(bound)
     if void is None and n < needed:
         said = (
-            f"nothing to judge: {n} of {len(found.holds)} rollouts {to_judge}, and at least "
+            f"nothing to judge: {n} of {len(found.holds)} rollouts {claim.to_judge}, and at least "
             f"{needed} are needed to show {100 * certificate.share:g} %"
         )
     return Verdict(
-        name=name,
+        name=claim.name,
         claim=said,
-        evidence=evidence,
-        holds=void is None and shown and also,
+        evidence=claim.evidence,
+        holds=void is None and shown and claim.also,
         bound=bound if void is None else None,
         confidence=certificate.confidence,
-        scope=limits(game, steps) | dict(scope or {}),
+        scope=limits(loop.game, claim.steps) | dict(claim.scope),
         trials=n,
         successes=k,
-        worst=worst_of(game, seed, "certify", found, found.asked) if n else None,
-        figures={"share_asked": certificate.share, "drawn": len(found.holds)} | dict(figures or {}),
+        worst=worst_of(loop.game, seed, "certify", found, found.asked) if n else None,
+        figures={"share_asked": certificate.share, "drawn": len(found.holds)} | dict(claim.figures),
     )
 
 
@@ -343,9 +339,9 @@ def arrival(game: AbstractGame) -> str:
 
 def arrived(edge: float, unit: str) -> str:
     """Success of a game that replaces nothing."""
-    if unit == "tolerance":
+    if unit == "tolerance" and edge == 1.0:
         return "every error within its tolerance"
-    return f"every agent within {edge:g} {unit} of its goal"
+    return f"every agent within {measured(edge, unit)} of its {'goal' if unit == 'm' else 'target'}"
 
 
 def limits(game: AbstractGame, steps: int, disturbance: str = "none") -> dict[str, Any]:

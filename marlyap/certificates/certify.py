@@ -9,6 +9,7 @@ import numpy as np
 
 from marlyap.certificates.certificate import AbstractCertificate, Verdict
 from marlyap.certificates.information import information
+from marlyap.certificates.loop import ClosedLoop
 from marlyap.certificates.lyapunov import AbstractLyapunov, CostSum, cost_sum, require_zero
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractRegulation
@@ -64,17 +65,18 @@ def certify(
     drives(game, controller)
     key = stream(seed, "calibrate")
     V = cost_sum(game, controller, key) if V is None else V
-    left_out = refused(certificates, game, controller, V, key)
+    loop = ClosedLoop(game, controller, V)
+    left_out = refused(certificates, loop, key)
     kept = {name: c for name, c in certificates.items() if name not in left_out}
     if not kept:
         raise UserError(" ".join(dict.fromkeys(left_out.values())))
     sampled = sum(c.evidence == "statistical" for c in kept.values())
     each = bonferroni(confidence, max(1, sampled) * checkpoints)
     asked = {name: dataclasses.replace(c, confidence=each) for name, c in kept.items()}
-    uses, verdicts = information(game, controller, key), {}
+    uses, verdicts = information(game, loop.controller, key), {}
     for name, certificate in asked.items():
         begin(name)
-        verdict = certificate.check(game, controller, V, seed)
+        verdict = certificate.check(loop, seed)
         scope = verdict.scope | {"information": uses}
         verdicts[name] = dataclasses.replace(verdict, scope=scope)
         tell(verdicts[name])
@@ -97,18 +99,14 @@ def certify(
 
 
 def refused(
-    certificates: Mapping[str, AbstractCertificate],
-    game: AbstractRegulation,
-    controller: Controller,
-    V: AbstractLyapunov,
-    key: Key,
+    certificates: Mapping[str, AbstractCertificate], loop: ClosedLoop, key: Key
 ) -> dict[str, str]:
     """Which certificates are not about such a game, controller or V, each with one sentence."""
     reasons, zero = {}, None
     if any(c.asks_V for c in certificates.values()):
-        zero = why_not(lambda: require_zero(game, V, key))
+        zero = why_not(lambda: require_zero(loop.game, loop.V, key))
     for name, certificate in certificates.items():
-        why = why_not(lambda c=certificate: c.refuse(game, controller, V))
+        why = why_not(lambda c=certificate: c.refuse(loop))
         why = why or (zero if certificate.asks_V else None)
         if why is not None:
             reasons[name] = why

@@ -46,21 +46,24 @@ class ClosedForm(AbstractCertificate):
     confidence: float = 1.0
     evidence: ClassVar[Evidence] = "proved"
 
-    def refuse(self, game: Any, controller: Any, V):
+    def refuse(self, loop):
+        controller: Any = loop.controller
         if type(controller) is not PointOffset:
             raise UserError(
                 f"closed-form: {type(controller).__name__} is not the controller PointOffset, the "
                 "only one this certificate is about."
             )
-        require_model("closed-form", game, controller, (Unicycle,))
+        game = require_model("closed-form", loop, (Unicycle,))
         stiffness(game, controller)
         spread = np.array([0.2, 0.2, np.pi, 0.2, 0.2])
         states = drawn(game, spread, np.zeros((SAMPLES, game.agents, 2)))
         model = lambda states: successor(game, controller, np.asarray(states.x))
-        require_step("closed-form", game, controller, states, model, lambda game, s: s.x)
+        require_step("closed-form", loop, states, model, lambda game, s: s.x)
 
-    def check(self, game: Any, controller: Any, V, seed):
-        self.refuse(game, controller, V)
+    def check(self, loop, seed):
+        self.refuse(loop)
+        game: Any = loop.game
+        controller: Any = loop.controller
         K, root = stiffness(game, controller)
         modes = [mode(mu, controller) for mu in np.linalg.eigvalsh(K)]
         sampled = max(sampled_radius(m["mu"], controller, game.dt) for m in modes)

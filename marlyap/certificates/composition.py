@@ -13,10 +13,13 @@ import scipy  # its parts are loaded when they are first used
 from marlyap import graph as graphs
 from marlyap.certificates.certificate import (
     AbstractCertificate,
+    Claim,
+    Draw,
     Evidence,
     Judgement,
     enough,
     judged,
+    measured,
     of_share,
     percent,
     until_step,
@@ -24,11 +27,11 @@ from marlyap.certificates.certificate import (
 from marlyap.games.game import AbstractRegulation
 
 
-def claim(bound: float, rho: float, farthest: float, steps: int, dt: float) -> str:
+def claim(bound: float, rho: float, farthest: str, until: str) -> str:
     return (
         f"at least {percent(bound)} of starts obey the fitted inequalities between neighbours "
-        f"(spectral radius {rho:.3f}) {until_step(steps, dt)}; they pull every distance towards "
-        f"at most {farthest:.3g} m as long as they are obeyed, and nothing is said of later steps"
+        f"(spectral radius {rho:.3f}) {until}; they pull every distance towards "
+        f"at most {farthest} as long as they are obeyed, and nothing is said of later steps"
     )
 
 
@@ -53,19 +56,18 @@ class Composition(AbstractCertificate):
     calibration: int = 3_000
     T: int = 10  # steps
     stay: int = 40  # steps past the horizon that are judged
-    weights: tuple[float, ...] = (0.01, 0.03, 0.1, 0.3, 1.0)  # price of a gain against delta (m)
+    weights: tuple[float, ...] = (0.01, 0.03, 0.1, 0.3, 1.0)  # price of a gain against delta
     slack: float = 0.2  # relative, on delta
-    within: float | None = None  # the largest ultimate bound that is worth claiming (m); the radius
+    within: float | None = None  # largest ultimate bound worth claiming; None: the edge
     share: float = 0.9
     confidence: float = 0.999
     evidence: ClassVar[Evidence] = "statistical"
 
-    def check(self, game, controller, V, seed):
+    def check(self, loop, seed):
         enough(self.rollouts, self.share, self.confidence)
+        game, windows = loop.game, _Windows(self.T)
         steps = game.horizon + self.stay + self.T
-        draw = lambda purpose, n: judged(
-            _Windows(self.T), game, controller, V, seed, purpose, n, steps
-        )
+        draw = lambda purpose, n: judged(windows, loop, Draw(seed, purpose, n), steps)
         data = draw("calibrate", self.calibration)
         M, delta, ultimate = self.fit(game, data.figures["V"][data.holds])
         rho = float(np.max(np.abs(np.linalg.eigvals(M)))) if np.isfinite(M).all() else np.inf
@@ -80,17 +82,13 @@ class Composition(AbstractCertificate):
         )
         farthest = float(np.max(ultimate))
         within = game.edge if self.within is None else self.within
-        say = lambda bound: claim(bound, rho, farthest, steps, game.dt)
-        return of_share(
-            self,
-            game,
-            V,
-            seed,
-            found,
-            steps,
+        far = measured(farthest, game.unit, 3)
+        say = lambda bound: claim(bound, rho, far, until_step(steps, game.dt))
+        what = Claim(
+            "composition",
             say,
-            name="composition",
-            void=nothing_contracted(rho, farthest, int(above.sum()), len(above)),
+            steps,
+            void=nothing_contracted(rho, far, int(above.sum()), len(above)),
             also=farthest <= within,
             figures={
                 "rho": rho,
@@ -101,6 +99,7 @@ class Composition(AbstractCertificate):
                 "T": self.T,
             },
         )
+        return of_share(self, loop, seed, found, what)
 
     def fit(
         self, game: AbstractRegulation, values: np.ndarray
@@ -125,14 +124,14 @@ class Composition(AbstractCertificate):
         return best
 
 
-def nothing_contracted(rho: float, farthest: float, above: int, rollouts: int) -> str | None:
+def nothing_contracted(rho: float, farthest: str, above: int, rollouts: int) -> str | None:
     """Why the inequalities say nothing about a team that comes together; None where they do."""
     if rho == math.inf:
         return "nothing was contracted: no inequalities with a spectral radius below 1 were found"
     if 2 * above < rollouts:
         return (
             f"nothing was contracted: {above} of {rollouts} rollouts begin above the bound "
-            f"of {farthest:.3g} m that the inequalities give, and at least half have to"
+            f"of {farthest} that the inequalities give, and at least half have to"
         )
     return None
 

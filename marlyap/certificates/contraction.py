@@ -9,6 +9,8 @@ import numpy as np
 
 from marlyap.certificates.certificate import (
     AbstractCertificate,
+    Claim,
+    Draw,
     Evidence,
     Found,
     Judgement,
@@ -55,33 +57,29 @@ class Contraction(AbstractCertificate):
     rollouts: int = 10_000  # of the test
     calibration: int = 10_000  # rollouts that choose beta
     T: int = 20  # steps
-    c_min: float | None = None  # (m); None: the game's radius
+    c_min: float | None = None  # a cost; None: the game's edge of success
     least: float = 0.01  # a smaller beta is no contraction: in H steps it cannot be told from 0
     share: float = 0.98
     confidence: float = 0.999
     evidence: ClassVar[Evidence] = "statistical"
 
-    def check(self, game, controller, V, seed):
-        self.refuse(game, controller, V)
+    def check(self, loop, seed):
+        self.refuse(loop)
         enough(self.rollouts, self.share, self.confidence)
-        H, n = game.horizon, self.rollouts
-        first = judged(self.judge, game, controller, V, seed, "calibrate", self.calibration, H + 1)
+        game, H = loop.game, loop.game.horizon
+        draw = lambda purpose, n: judged(self.judge, loop, Draw(seed, purpose, n), H + 1)
+        first = draw("calibrate", self.calibration)
         chosen, beta = rates(first)[first.asked], -math.inf
         if len(chosen):
             beta = passing(chosen, self.rollouts, self.share, self.confidence)
-        found = judged(self.judge, game, controller, V, seed, "certify", n, H + 1)
+        found = draw("certify", self.rollouts)
         rate, floor = rates(found), self.floor(game)
         found = dataclasses.replace(found, holds=found.holds & (rate >= beta), badness=-rate)
         say = lambda bound: claim(bound, beta, self.T, floor, self.least, H, game.dt)
-        return of_share(
-            self,
-            game,
-            V,
-            seed,
-            found,
-            H,
+        what = Claim(
+            "contraction",
             say,
-            name="contraction",
+            H,
             also=beta >= self.least,
             to_judge=f"have a cost above {floor:g} with {self.T} steps to go",
             figures={
@@ -92,12 +90,13 @@ class Contraction(AbstractCertificate):
                 "calibration": self.calibration,
             },
         )
+        return of_share(self, loop, seed, found, what)
 
-    def refuse(self, game, controller, V):
-        if self.T > game.horizon:
+    def refuse(self, loop):
+        if self.T > loop.game.horizon:
             raise UserError(
-                f"contraction: {self.T} steps do not fit into an episode of {game.horizon}; take a "
-                "smaller T."
+                f"contraction: {self.T} steps do not fit into an episode of {loop.game.horizon}; "
+                "take a smaller T."
             )
 
     def floor(self, game) -> float:

@@ -8,11 +8,14 @@ import numpy as np
 
 from marlyap.certificates.certificate import (
     AbstractCertificate,
+    Claim,
+    Draw,
     Evidence,
     Judgement,
     arrival,
     enough,
     judged,
+    measured,
     of_share,
     percent,
     until_step,
@@ -20,13 +23,11 @@ from marlyap.certificates.certificate import (
 from marlyap.errors import UserError
 
 
-def claim(
-    bound: float, V: str, beta: float, ball: float, arrived: str, steps: int, dt: float
-) -> str:
+def claim(bound: float, V: str, beta: float, ball: str, arrived: str, steps: int, dt: float) -> str:
     return (
         f"at least {percent(bound)} of the starts outside the ball come to {arrived} "
         f"{until_step(steps, dt).replace('until', 'by')}, and in every step before that V, {V}, "
-        f"falls by at least {beta:g} of the mean distance beyond {ball:g} m"
+        f"falls by at least {beta:g} of the mean distance beyond {ball}"
     )
 
 
@@ -50,31 +51,25 @@ class Decrease(AbstractCertificate):
     evidence: ClassVar[Evidence] = "statistical"
     asks_V: ClassVar[bool] = True
 
-    def check(self, game, controller, V, seed):
+    def check(self, loop, seed):
         enough(self.rollouts, self.share, self.confidence)
         if not self.beta > 0:
             raise UserError(f"beta: V must fall, so that {self.beta:g} must be more than 0.")
-        H, n = game.horizon, self.rollouts
-        found = judged(self.judge, game, controller, V, seed, "certify", n, H + V.beyond, True)
+        game, V, H = loop.game, loop.V, loop.game.horizon
+        draw = Draw(seed, "certify", self.rollouts)
+        found = judged(self.judge, loop, draw, H + V.beyond, uses_V=True)
         steps, bad = (float(np.nansum(found.figures[name])) for name in ("steps", "violations"))
-        say = lambda bound: claim(bound, V.meaning, self.beta, V.ball, arrival(game), H, game.dt)
-        return of_share(
-            self,
-            game,
-            V,
-            seed,
-            found,
-            H,
-            say,
-            name="decrease",
-            to_judge="begin outside the ball",
-            figures={
-                "beta": self.beta,
-                "V": type(V).__name__,
-                "transitions_violating": bad / max(steps, 1.0),
-                "entered": int(np.sum(found.figures["entered"] > 0)),
-            },
-        )
+        ball = measured(V.ball, game.unit)
+        say = lambda bound: claim(bound, V.meaning, self.beta, ball, arrival(game), H, game.dt)
+        figures = {
+            "beta": self.beta,
+            "V": type(V).__name__,
+            "transitions_violating": bad / max(steps, 1.0),
+            "entered": int(np.sum(found.figures["entered"] > 0)),
+        }
+        outside = "begin outside the ball"
+        what = Claim("decrease", say, H, to_judge=outside, figures=figures)
+        return of_share(self, loop, seed, found, what)
 
     def judge(self, game, V, trajectory, key):
         H = game.horizon

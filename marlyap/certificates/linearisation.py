@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from marlyap.certificates.certificate import AbstractCertificate, Evidence, Verdict
 from marlyap.certificates.jacobian import jacobian
+from marlyap.errors import UserError
 from marlyap.games.game import AbstractRegulation
 from marlyap.simulation.rollout import Controller
 from marlyap.types import State
@@ -74,9 +75,19 @@ class Linearisation(AbstractCertificate):
     confidence: float = 1.0
     evidence: ClassVar[Evidence] = "proved"
 
-    def check(self, game, controller, V, seed):
+    def refuse(self, loop):
         with jax.enable_x64(True):
-            looks = look(as_double(game), as_double(controller), self, seed)
+            speed = float(moving_target(as_double(loop.game), jax.random.key(0)))
+        if speed > AT_REST:
+            raise UserError(
+                "linearisation: the target set moves in time, and it speaks of rest at one point; "
+                "take a certificate that plays the game, such as reach-and-stay."
+            )
+
+    def check(self, loop, seed):
+        self.refuse(loop)
+        with jax.enable_x64(True):
+            looks = look(as_double(loop.game), as_double(loop.controller), self, seed)
         fault = next((x["fault"] for x in looks if x["fault"]), None)
         radius = max((x["radius"] for x in looks), default=np.inf)
         negatives = [x["free"] for x in looks]
@@ -168,6 +179,21 @@ def look(
             | {"dimension": len(A), "action": float(action), "moved": float(moved)}
         )
     return found
+
+
+@eqx.filter_jit
+def moving_target(game: AbstractRegulation, key: Array) -> Array:
+    """How far the target set moves, by the largest change of an error or a state; 0 if it rests.
+
+    It moves where a state of it has errors at a later time, or where the holding action takes the
+    team elsewhere while the errors stay zero.
+    """
+    state = game.at_target(game.reset(key))
+    errors = lambda s: game.errors(s).ravel()
+    held = game.step(state, game.hold(state))
+    gone = jnp.max(jnp.abs(coordinates(held)[0] - coordinates(state)[0]))
+    follows = jnp.max(jnp.abs(errors(held))) <= AT_REST
+    return jnp.maximum(_later(state, errors), jnp.where(follows, gone, 0.0))
 
 
 def _first(faults: Any) -> str | None:

@@ -18,6 +18,12 @@ from marlyap.simulation.rollout import Controller, rollout
 from marlyap.types import Scalar, State, Trajectory
 
 
+def measured(distance: float, unit: str, digits: int = 6) -> str:
+    """A distance with its unit, such as "0.1 m" or "2 tolerances"."""
+    plural = "s" if unit == "tolerance" and distance != 1.0 else ""
+    return f"{distance:.{digits}g} {unit}{plural}"
+
+
 class AbstractLyapunov(eqx.Module):
     """V(s) >= 0. It has to fall by a share of c_rho(s), the mean of max(0, distance_i - rho)."""
 
@@ -61,7 +67,7 @@ class CostSum(AbstractLyapunov):
 
     @property
     def meaning(self):
-        return f"the sum of the next {self.T} costs beyond {self.ball:g} {self.unit}"
+        return f"the sum of the next {self.T} costs beyond {measured(self.ball, self.unit)}"
 
     @property
     def beyond(self):

@@ -8,12 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from marlyap.certificates.linearisation import as_double
+from marlyap.certificates.loop import ClosedLoop
 from marlyap.errors import UserError
 from marlyap.games.dynamics import AbstractDynamics
 from marlyap.games.game import AbstractRegulation
 from marlyap.games.planar import AbstractPlanar, Goals
-from marlyap.simulation.rollout import Controller
-from marlyap.storage.hashing import as_json
 from marlyap.tasks.rendezvous import Rendezvous
 from marlyap.types import State
 
@@ -26,9 +25,10 @@ ROUNDING = 1e-9  # in float64, of states of the size of metres
 
 
 def require_model(
-    name: str, game: AbstractRegulation, controller: Any, kinds: tuple[type[AbstractDynamics], ...]
-) -> None:
-    """Raise UserError unless the game is Rendezvous as it stands, and the controller's game too."""
+    name: str, loop: ClosedLoop, kinds: tuple[type[AbstractDynamics], ...]
+) -> AbstractPlanar:
+    """The loop's game, which is Rendezvous as it stands; UserError where it is not."""
+    game = loop.game
     other = [
         part for part in PARTS if getattr(type(game), part, None) is not getattr(Rendezvous, part)
     ]
@@ -44,14 +44,12 @@ def require_model(
             f"{name}: its formulas are about {known} with Euler steps, not "
             f"{type(game.dynamics).__name__} with {game.dynamics.integrator}."
         )
-    if as_json(controller.game) != as_json(game):
-        raise UserError(f"{name}: the controller was made for another game than this one.")
+    return game
 
 
 def require_step(
     name: str,
-    game: AbstractRegulation,
-    controller: Controller,
+    loop: ClosedLoop,
     states: State,
     model: Callable[[State], np.ndarray],
     of: Callable[[AbstractRegulation, State], Any],
@@ -62,19 +60,20 @@ def require_step(
     of them [sample, ...]; of, the game's, from the state after one step.
     """
     with jax.enable_x64(True):
-        game, controller, states = as_double(game), as_double(controller), as_double(states)
+        exact, states = as_double(loop), as_double(states)
 
         @jax.jit
         def after(states: State) -> Any:
-            one = lambda s: of(game, game.step(s, controller(s, jax.random.key(0))))
+            act = lambda s: exact.controller(s, jax.random.key(0))
+            one = lambda s: of(exact.game, exact.game.step(s, act(s)))
             return jax.vmap(one)(states)
 
         mine, theirs = np.asarray(after(states), float), model(states)
     gap = float(np.max(np.abs(mine - theirs)))
     if not gap <= ROUNDING * (1 + float(np.max(np.abs(theirs)))):
         raise UserError(
-            f"{name}: a step of {type(game).__name__} ends {gap:.3g} beside the formula's; it is "
-            "not about this game."
+            f"{name}: a step of {type(loop.game).__name__} ends {gap:.3g} beside the formula's; "
+            "it is not about this game."
         )
 
 

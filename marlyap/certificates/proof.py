@@ -13,6 +13,7 @@ from rich.progress import Progress
 from marlyap.certificates import bounds as B, model
 from marlyap.certificates.bounds import Affine
 from marlyap.certificates.certificate import AbstractCertificate, Evidence, Verdict
+from marlyap.certificates.loop import ClosedLoop
 from marlyap.certificates.lyapunov import Approach, Norm, Quadratic
 from marlyap.errors import UserError
 from marlyap.games.dynamics import DoubleIntegrator, Unicycle
@@ -56,28 +57,29 @@ class Proof(AbstractCertificate):
     evidence: ClassVar[Evidence] = "proved"
     asks_V: ClassVar[bool] = True
 
-    def refuse(self, game, controller, V):
+    def refuse(self, loop):
         half = np.array(self.half)
         if len(half) != 4 or not 0 < self.rho <= self.inner <= self.c or not (half > 0).all():
             raise UserError("proof: four half widths and 0 < rho <= inner <= c are needed.")
         if not (self.eta >= 0 and 0 <= self.decay < 1 and self.eta + self.decay > 0):
             raise UserError("proof: V must fall; take eta >= 0 and decay in [0, 1), not both 0.")
-        loop = Loop(game, controller)
-        lyapunov(V, game.edge)
-        heading = [np.pi] if loop.turns else []
-        states = model.drawn(game, np.array([0.0, 0.0, *heading, *half[2:]]), self.goals())
-        answer = lambda states: loop(reduced(game, states)).b[:, None]
+        boxes = Loop(loop)
+        lyapunov(loop.V, loop.game.edge)
+        heading = [np.pi] if boxes.turns else []
+        states = model.drawn(loop.game, np.array([0.0, 0.0, *heading, *half[2:]]), self.goals())
+        answer = lambda states: boxes(reduced(loop.game, states)).b[:, None]
         errors = lambda game, state: game.errors(state)
-        model.require_step("proof", game, controller, states, answer, errors)
+        model.require_step("proof", loop, states, answer, errors)
 
     def goals(self) -> np.ndarray:
         """Goals [sample, 1, 2] of one agent at the origin, as far as the box reaches (m)."""
         shape = (model.SAMPLES, 1, 2)
         return np.random.default_rng(1).uniform(-1, 1, shape) * np.array(self.half[:2])
 
-    def check(self, game, controller, V, seed):
-        self.refuse(game, controller, V)
-        loop, V_of = Loop(game, controller), lyapunov(V, game.edge)
+    def check(self, loop, seed):
+        self.refuse(loop)
+        game, controller, V = loop.game, loop.controller, loop.V
+        boxes, V_of = Loop(loop), lyapunov(V, game.edge)
         self.require_content(V_of)
         todo, looked, settled = self.begin(controller, V)
         found, total = None, float(np.prod(2 * np.array(self.half)))
@@ -86,7 +88,7 @@ class Proof(AbstractCertificate):
             task = bar.add_task("proof", total=1.0)
             while len(todo) and looked < self.most and found is None:
                 now, todo = todo[-self.batch :], todo[: -self.batch]
-                keep, level, found = self.settle(now, loop, V_of)
+                keep, level, found = self.settle(now, boxes, V_of)
                 looked += len(now)
                 settled += float(np.prod(2 * now[~keep, 1], axis=1).sum())
                 wide = extents(V, np.clip(level, self.rho, self.c), np.array(self.half))
@@ -201,7 +203,9 @@ class Proof(AbstractCertificate):
 class Loop:
     """f(x) = one step under the controller, for boxes of reduced states."""
 
-    def __init__(self, game: Any, controller: Any):
+    def __init__(self, loop: ClosedLoop):
+        game = loop.game
+        controller: Any = loop.controller
         policy: Any = controller.policy if type(controller) is Decentralised else None
         pi = policy.pi if type(policy) is Greedy else None
         if game.agents != 1 or type(pi) is not Actors:
@@ -209,7 +213,7 @@ class Loop:
                 "proof: only a trained policy of one agent, unicycle or double integrator with "
                 "Euler steps, can be proved; set agents=1."
             )
-        model.require_model("proof", game, controller, (Unicycle, DoubleIntegrator))
+        game = model.require_model("proof", loop, (Unicycle, DoubleIntegrator))
         self.dt, self.scale = game.dt, game.edge
         self.limits, self.turns = game.dynamics.limits, type(game.dynamics) is Unicycle
         self.layers = weights(pi.net, None if pi.shared else 0)

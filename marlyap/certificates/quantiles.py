@@ -11,6 +11,7 @@ import numpy as np
 
 from marlyap.certificates.certificate import (
     AbstractCertificate,
+    Draw,
     Evidence,
     Judgement,
     Verdict,
@@ -28,12 +29,13 @@ NAMES = ("final_distance", "settling_time", "largest_rise")
 FLOAT32 = 1e-6  # relative: 0.3 seconds may be 0.30000001
 
 
-def claim(q: float, bounds: Mapping[str, float], V: str, steps: int, dt: float) -> str:
+def claim(q: float, bounds: Mapping[str, float], V: str, unit: str, until: str) -> str:
     distance, time, rise = (at_most(bounds[name]) for name in NAMES)
-    m, s = (" m" if distance != "unbounded" else ""), (" s" if time != "unbounded" else "")
+    unit = "tolerances" if unit == "tolerance" else unit
+    of, s = (f" {unit}" if distance != "unbounded" else ""), (" s" if time != "unbounded" else "")
     return (
-        f"each of these is true of at least {100 * q:g} % of starts, {until_step(steps, dt)}: "
-        f"final distance {distance}{m}; settling time {time}{s}; largest rise {rise} of V, {V}"
+        f"each of these is true of at least {100 * q:g} % of starts, {until}: "
+        f"final distance {distance}{of}; settling time {time}{s}; largest rise {rise} of V, {V}"
     )
 
 
@@ -65,7 +67,8 @@ class Quantiles(AbstractCertificate):
     evidence: ClassVar[Evidence] = "statistical"
     asks_V: ClassVar[bool] = True
 
-    def check(self, game, controller, V, seed):
+    def check(self, loop, seed):
+        game, V = loop.game, loop.V
         each = bonferroni(self.confidence, len(NAMES))
         needed = trials_needed(1 - self.q, each)
         if self.rollouts < needed:
@@ -74,16 +77,17 @@ class Quantiles(AbstractCertificate):
                 f"{each:.6g}; at least {needed} are needed."
             )
         H, n = game.horizon, self.rollouts
-        found = judged(self.judge, game, controller, V, seed, "certify", n, H + V.beyond, True)
+        draw = Draw(seed, "certify", n)
+        found = judged(self.judge, loop, draw, H + V.beyond, uses_V=True)
         sample = {
             name: np.where(found.holds & ~np.isnan(v), v, np.inf)
             for name, v in found.figures.items()
         }
         bounds = {name: quantile_upper_bound(sample[name], self.q, each) for name in NAMES}
-        void = no_lyapunov(V, found)
+        void = no_lyapunov(found)
         return Verdict(
             name="quantiles",
-            claim=void or claim(self.q, bounds, V.meaning, H, game.dt),
+            claim=void or claim(self.q, bounds, V.meaning, game.unit, until_step(H, game.dt)),
             evidence=self.evidence,
             holds=void is None and bool(np.all(np.isfinite(list(bounds.values())))),
             bound=None if void else bounds["final_distance"],

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 
 from marlyap.certificates.certificate import (
     AbstractCertificate,
+    Claim,
+    Draw,
     Evidence,
     Judgement,
     arrival,
@@ -44,12 +46,12 @@ class Reach(AbstractCertificate):
     confidence: float = 0.999
     evidence: ClassVar[Evidence] = "statistical"
 
-    def check(self, game, controller, V, seed):
+    def check(self, loop, seed):
         enough(self.rollouts, self.share, self.confidence)
-        H = game.horizon
-        found = judged(self.judge, game, controller, V, seed, "certify", self.rollouts, H)
+        game, H = loop.game, loop.game.horizon
+        found = judged(self.judge, loop, Draw(seed, "certify", self.rollouts), H)
         say = lambda bound: claim(bound, arrival(game), H * game.dt)
-        return of_share(self, game, V, seed, found, H, say, name="reach")
+        return of_share(self, loop, seed, found, Claim("reach", say, H))
 
     def judge(self, game, V, trajectory, key):
         last = jax.tree.map(lambda leaf: leaf[-1], trajectory.state)
@@ -73,13 +75,13 @@ class ReachAndStay(AbstractCertificate):
     confidence: float = 0.999
     evidence: ClassVar[Evidence] = "statistical"
 
-    def check(self, game, controller, V, seed):
+    def check(self, loop, seed):
         enough(self.rollouts, self.share, self.confidence)
-        steps = game.horizon + self.stay
-        found = judged(self.judge, game, controller, V, seed, "certify", self.rollouts, steps)
+        game, steps = loop.game, loop.game.horizon + self.stay
+        found = judged(self.judge, loop, Draw(seed, "certify", self.rollouts), steps)
         say = lambda bound: claim_stay(bound, arrival(game), game.horizon, steps, game.dt)
-        name, figures = "reach-and-stay", {"stay_steps": self.stay}
-        return of_share(self, game, V, seed, found, steps, say, name=name, figures=figures)
+        what = Claim("reach-and-stay", say, steps, figures={"stay_steps": self.stay})
+        return of_share(self, loop, seed, found, what)
 
     def judge(self, game, V, trajectory, key):
         late = jax.tree.map(lambda leaf: leaf[game.horizon :], trajectory.state)

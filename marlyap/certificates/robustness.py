@@ -2,13 +2,13 @@
 
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from marlyap.certificates.certificate import (
     AbstractCertificate,
+    Draw,
     Evidence,
     Verdict,
     arrival,
@@ -19,11 +19,11 @@ from marlyap.certificates.certificate import (
     percent,
     worst_of,
 )
+from marlyap.certificates.loop import ClosedLoop
 from marlyap.certificates.reach import Reach
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractRegulation
-from marlyap.games.perturbed import Perturbed, edge_to_cut, follower_to_lose, traced
-from marlyap.simulation.rollout import Controller
+from marlyap.games.perturbed import edge_to_cut, follower_to_lose
 from marlyap.statistics import bonferroni
 from marlyap.types import Key
 
@@ -68,20 +68,21 @@ class Robustness(AbstractCertificate):
     confidence: float = 0.999
     evidence: ClassVar[Evidence] = "statistical"
 
-    def check(self, game, controller, V, seed):
-        games, without = self.perturbed(game)
-        if not games:
+    def check(self, loop, seed):
+        game = loop.game
+        loops, without = self.perturbed(loop)
+        if not loops:
             raise UserError(f"robustness: no perturbation can be applied ({listed(without)}).")
-        each = bonferroni(self.confidence, len(games))
+        each = bonferroni(self.confidence, len(loops))
         enough(self.rollouts, self.share, each)
         points, weakest = [], None
-        for name, (change, other) in games.items():
-            point = self.point(other, controller, V, seed, each)
+        for name, (change, other) in loops.items():
+            point = self.point(other, seed, each)
             points.append({"perturbation": name, "change": change} | point)
             if weakest is None or point["successes"] < weakest["successes"]:
                 weakest = points[-1]
         least = min(p["bound"] for p in points)
-        disturbance = f"each in turn: {', '.join(games)}"
+        disturbance = f"each in turn: {', '.join(loops)}"
         return Verdict(
             name="robustness",
             claim=claim(least, len(points), arrival(game), game.horizon * game.dt, without),
@@ -102,31 +103,31 @@ class Robustness(AbstractCertificate):
         )
 
     def perturbed(
-        self, game: AbstractRegulation
-    ) -> tuple[dict[str, tuple[dict[str, Any], Perturbed]], dict[str, str]]:
+        self, loop: ClosedLoop
+    ) -> tuple[dict[str, tuple[dict[str, Any], ClosedLoop]], dict[str, str]]:
         """The points of the curve that can be tested, and why the others cannot."""
-        games, without = {}, {}
-        idle = self.gains and gain_is_idle(game)
-        for name, change in self.perturbations(game).items():
+        loops, without = {}, {}
+        idle = self.gains and gain_is_idle(loop.game)
+        for name, change in self.perturbations(loop.game).items():
             if idle and "gain" in change:
                 without[name] = "the inputs of this game do not get stronger by `strengthened`"
                 continue
+            if "drop" in change and not loop.game.adjacency.any():
+                without[name] = "no agent of this game sees another"
+                continue
             try:
-                games[name] = change, traced(Perturbed(inner=game, **change))
+                loops[name] = change, loop.under(**change)
             except UserError as error:
-                without[name] = str(error).removeprefix("perturbation: ").rstrip(".")
-        return games, without
+                without[name] = str(error).partition(": ")[2].rstrip(".")
+        return loops, without
 
-    def point(
-        self, game: Perturbed, controller: Controller, V: Any, seed: int, each: float
-    ) -> dict[str, Any]:
+    def point(self, loop: ClosedLoop, seed: int, each: float) -> dict[str, Any]:
         """C1 under one perturbation."""
-        n, H = self.rollouts, game.horizon
-        driver = moved(controller, game)
-        found = judged(Reach().judge, game, driver, V, seed, "certify", n, H)
+        n, H = self.rollouts, loop.game.horizon
+        found = judged(Reach().judge, loop, Draw(seed, "certify", n), H)
         k = int(found.holds.sum())
         bound, holds = at_least(k, n, self.share, each)
-        worst = worst_of(game, seed, "certify", found)
+        worst = worst_of(loop.game, seed, "certify", found)
         return {"trials": n, "successes": k, "bound": bound, "holds": holds, "worst": worst}
 
     def perturbations(self, game: AbstractRegulation) -> dict[str, dict[str, Any]]:
@@ -143,14 +144,6 @@ class Robustness(AbstractCertificate):
         if self.remove and edge is not None:
             curve[f"without edge {edge[0]}-{edge[1]}"] = {"cut": (edge,)}
         return curve
-
-
-def moved(controller: Controller, game: Perturbed) -> Controller:
-    """The controller with the perturbed game's eyes, but the nominal limits that it was told."""
-    if not isinstance(getattr(controller, "game", None), AbstractRegulation):
-        return controller
-    eyes = eqx.tree_at(lambda g: g.gain, game, jnp.asarray(1.0))
-    return eqx.tree_at(lambda c: c.game, controller, eyes)  # pyright: ignore
 
 
 def gain_is_idle(game: AbstractRegulation) -> bool:

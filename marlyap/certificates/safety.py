@@ -7,9 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 
 from marlyap.certificates.certificate import (
     AbstractCertificate,
+    Claim,
+    Draw,
     Evidence,
     Judgement,
     enough,
@@ -22,13 +25,16 @@ from marlyap.certificates.certificate import (
 )
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
+from marlyap.types import State
 
 
-def claim_safe(bound: float, game: str, steps: int, dt: float) -> str:
-    return (
-        f"on at least {percent(bound)} of starts no agent breaks a rule of {game} "
-        f"(its `violations`) at any step {until_step(steps, dt)}"
-    )
+def claim_safe(bound: float, game: str, rules: tuple[str, ...], steps: int, dt: float) -> str:
+    """`rules` are those of `violations` and `failed` that the game replaces."""
+    broken = f"no agent breaks a rule of {game} (its `violations`)"
+    failed = f"{'nothing' if 'violations' in rules else f'no team of {game}'} fails (its `failed`)"
+    parts = {"violations": broken, "failed": failed}
+    never = " and ".join(parts[rule] for rule in rules)
+    return f"on at least {percent(bound)} of starts {never} at any step {until_step(steps, dt)}"
 
 
 def claim_apart(bound: float, gap: float, least: float, steps: int, dt: float) -> str:
@@ -40,13 +46,15 @@ def claim_apart(bound: float, gap: float, least: float, steps: int, dt: float) -
 
 
 class Safe(AbstractCertificate):
-    """No agent violates a rule of the game.
+    """No agent violates a rule of the game, and nothing fails.
 
     With the confidence asked for, over the sampling of starts s_0 ~ rho,
 
-        P[ no agent violates a rule of the game in s_t, for all t <= H + S ] >= bound,
+        P[ no agent violates a rule and the team has not failed in s_t, for all t <= H + S ] >=
+        bound,
 
-    with `game.violations` the rules. It says nothing of what comes after H + S.
+    with `game.violations` the rules and `game.failed` the failures, whichever the game has. It says
+    nothing of what comes after H + S.
     """
 
     rollouts: int = 10_000
@@ -55,8 +63,8 @@ class Safe(AbstractCertificate):
     confidence: float = 0.999
     evidence: ClassVar[Evidence] = "statistical"
 
-    def refuse(self, game, controller, V):
-        name = type(plain_game(game)).__name__
+    def refuse(self, loop):
+        game, name = loop.game, type(plain_game(loop.game)).__name__
         if not has_rules(game):
             raise UserError(
                 f"safe: {name} has no rule to break, since it does not replace `violations`; "
@@ -64,21 +72,22 @@ class Safe(AbstractCertificate):
             )
         if not can_fire(game):
             raise UserError(
-                f"safe: the `violations` of {name} never fire, not even with all agents in one "
-                "place or far out; set what they depend on, such as clearance."
+                f"safe: the `{rules(game)[0]}` of {name} never fire, not even with all agents in "
+                "one place or far out; set what they depend on, such as clearance."
             )
 
-    def check(self, game, controller, V, seed):
-        self.refuse(game, controller, V)
+    def check(self, loop, seed):
+        self.refuse(loop)
         enough(self.rollouts, self.share, self.confidence)
-        steps, name = game.horizon + self.stay, type(plain_game(game)).__name__
-        found = judged(self.judge, game, controller, V, seed, "certify", self.rollouts, steps)
-        say = lambda bound: claim_safe(bound, name, steps, game.dt)
-        figures = {"stay_steps": self.stay}
-        return of_share(self, game, V, seed, found, steps, say, name="safe", figures=figures)
+        game, name = loop.game, type(plain_game(loop.game)).__name__
+        steps = game.horizon + self.stay
+        found = judged(self.judge, loop, Draw(seed, "certify", self.rollouts), steps)
+        say = lambda bound: claim_safe(bound, name, rules(game), steps, game.dt)
+        what = Claim("safe", say, steps, figures={"stay_steps": self.stay})
+        return of_share(self, loop, seed, found, what)
 
     def judge(self, game, V, trajectory, key):
-        broken = jnp.any(jax.vmap(game.violations)(trajectory.state), axis=1)
+        broken = jax.vmap(lambda s: is_broken(game, s))(trajectory.state)
         steps = jnp.sum(broken).astype(float)
         return Judgement(~jnp.any(broken), steps, {"steps_in_violation": steps})
 
@@ -101,17 +110,24 @@ class Apart(AbstractCertificate):
     confidence: float = 0.999
     evidence: ClassVar[Evidence] = "statistical"
 
-    def refuse(self, game, controller, V):
+    def refuse(self, loop):
+        game = loop.game
+        if (
+            eqx.filter_eval_shape(lambda key: game.scene(game.reset(key)), jax.random.key(0))
+            is None
+        ):
+            raise UserError(
+                f"apart: {type(plain_game(game)).__name__} has no map, so that its agents have no "
+                "distance; return a Scene from `scene`, or leave out apart."
+            )
         if game.agents < 2:
             raise UserError("apart: a team of one has no two agents; set agents to 2 or more.")
 
-    def check(self, game, controller, V, seed):
-        self.refuse(game, controller, V)
+    def check(self, loop, seed):
+        self.refuse(loop)
         enough(self.rollouts, self.share, self.confidence)
-        steps = game.horizon + self.stay
-        draw = lambda purpose, count: judged(
-            self.judge, game, controller, V, seed, purpose, count, steps
-        )
+        game, steps = loop.game, loop.game.horizon + self.stay
+        draw = lambda purpose, n: judged(self.judge, loop, Draw(seed, purpose, n), steps)
         first, found = draw("calibrate", self.calibration), draw("certify", self.rollouts)
         gaps = np.where(first.holds, first.figures["gap"], 0.0)
         # To 0.1 mm, rounded down: the claim says what is tested.
@@ -119,18 +135,9 @@ class Apart(AbstractCertificate):
         d = float(np.floor(d * 1e4) / 1e4)
         found = dataclasses.replace(found, holds=found.holds & (found.figures["gap"] >= d))
         say = lambda bound: claim_apart(bound, d, self.least, steps, game.dt)
-        return of_share(
-            self,
-            game,
-            V,
-            seed,
-            found,
-            steps,
-            say,
-            name="apart",
-            also=d >= self.least,
-            figures={"gap": d, "stay_steps": self.stay, "calibration": self.calibration},
-        )
+        figures = {"gap": d, "stay_steps": self.stay, "calibration": self.calibration}
+        what = Claim("apart", say, steps, also=d >= self.least, figures=figures)
+        return of_share(self, loop, seed, found, what)
 
     def judge(self, game, V, trajectory, key):
         p = jax.vmap(game.positions)(trajectory.state)
@@ -140,9 +147,21 @@ class Apart(AbstractCertificate):
         return Judgement(jnp.asarray(True), -gap, {"gap": gap})
 
 
+def rules(game: AbstractGame) -> tuple[str, ...]:
+    """Which of `violations` and `failed` the game replaces: what `safe` is about."""
+    kind = type(plain_game(game))
+    own = lambda name: getattr(kind, name) is not getattr(AbstractGame, name)
+    return tuple(name for name in ("violations", "failed") if own(name))
+
+
 def has_rules(game: AbstractGame) -> bool:
-    """Whether the game has violations of its own."""
-    return type(plain_game(game)).violations is not AbstractGame.violations
+    """Whether the game has violations or failures of its own."""
+    return bool(rules(game))
+
+
+def is_broken(game: AbstractGame, state: State) -> Bool[Array, ""]:
+    """Whether an agent breaks a rule in this state, or the team has failed."""
+    return jnp.any(game.violations(state)) | game.failed(state)
 
 
 def can_fire(game: AbstractGame) -> bool:
@@ -150,9 +169,9 @@ def can_fire(game: AbstractGame) -> bool:
 
     def one(key):
         start = game.reset(key)
-        at = lambda x: jnp.any(game.violations(eqx.tree_at(lambda s: s.x, start, x)))
-        together = jnp.broadcast_to(start.x[:1], start.x.shape)
-        sizes = 10.0 ** jnp.arange(5)
-        return at(together) | jnp.any(jax.vmap(lambda size: at(size * (start.x + 1.0)))(sizes))
+        at = lambda x: is_broken(game, eqx.tree_at(lambda s: s.x, start, x))
+        together = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), start.x)
+        far = lambda size: jax.tree.map(lambda x: size * (x + 1.0), start.x)
+        return at(together) | jnp.any(jax.vmap(lambda size: at(far(size)))(10.0 ** jnp.arange(5)))
 
     return bool(jnp.any(jax.vmap(one)(jax.random.split(jax.random.key(0), 64))))

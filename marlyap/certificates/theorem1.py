@@ -11,6 +11,8 @@ from jax.flatten_util import ravel_pytree
 
 from marlyap.certificates.certificate import (
     AbstractCertificate,
+    Claim,
+    Draw,
     Evidence,
     Judgement,
     enough,
@@ -20,6 +22,7 @@ from marlyap.certificates.certificate import (
     percent,
 )
 from marlyap.certificates.jacobian import jacobian
+from marlyap.certificates.loop import seen_through
 from marlyap.certificates.lyapunov import Norm
 from marlyap.games.dynamics import AbstractDynamics, Independent, Unicycle
 from marlyap.games.game import AbstractGame, AbstractRegulation
@@ -65,12 +68,12 @@ class Theorem1(AbstractCertificate):
     evidence: ClassVar[Evidence] = "statistical"
     asks_V: ClassVar[bool] = True
 
-    def check(self, game, controller, V, seed):
+    def check(self, loop, seed):
         enough(self.rollouts, self.share, self.confidence)
-        n, H = self.rollouts, game.horizon
-        judge = _Tuple(controller, self.old, self.noise)
+        game, V, H = loop.game, loop.V, loop.game.horizon
+        judge = _Tuple(loop.controller, seen_through(game, self.old, "old"), self.noise)
         draw = lambda purpose: judged(
-            judge, game, controller, V, seed, purpose, n, H + V.beyond, True
+            judge, loop, Draw(seed, purpose, self.rollouts), H + V.beyond, uses_V=True
         )
         before, found = draw("calibrate"), draw("certify")
         fig = found.figures
@@ -86,16 +89,11 @@ class Theorem1(AbstractCertificate):
         )
         exact = l == constants.get("spectral") and not own_step(game)
         say = lambda bound: claim(bound, V.meaning)
-        return of_share(
-            self,
-            game,
-            V,
-            seed,
-            found,
-            H,
+        what = Claim(
+            "theorem1",
             say,
-            name="theorem1",
-            void=no_lyapunov(V, before, found),
+            H,
+            void=no_lyapunov(before, found),
             to_judge="gave a state outside the ball",
             evidence=self.evidence if exact else "observed",
             scope={"tuples": "one per rollout, at a random time"},
@@ -104,6 +102,7 @@ class Theorem1(AbstractCertificate):
             | {"margin_median": float(np.median(-excess[asked])) if asked.any() else None}
             | {"margin_worst": float(np.min(-excess[asked])) if asked.any() else None},
         )
+        return of_share(self, loop, seed, found, what)
 
     def constants(
         self, game: AbstractRegulation, V: Any, seen: dict[str, np.ndarray]

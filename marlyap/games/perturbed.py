@@ -263,6 +263,14 @@ def traced(game: Perturbed) -> Perturbed:
     return eqx.tree_at(numbers, game, tuple(jnp.asarray(float(x)) for x in numbers(game)))
 
 
+def nominal_limits(game: AbstractGame) -> AbstractGame:
+    """The same, perturbed in all but the strength of its inputs: what a controller is told."""
+    if not isinstance(game, Perturbed):
+        return game
+    parts = lambda g: (g.inner, g.gain)
+    return eqx.tree_at(parts, game, (nominal_limits(game.inner), jnp.asarray(1.0)))
+
+
 def _on(x: float | Array) -> bool:
     return not isinstance(x, (int, float)) or x != 0
 
