@@ -5,6 +5,7 @@
 
 import dataclasses
 import inspect
+import re
 from pathlib import Path
 
 import marlyap
@@ -64,8 +65,8 @@ def _class(cls: type) -> list[str]:
     own = {k: v for k, v in vars(cls).items() if not k.startswith("_")}
     for name, member in own.items():
         function = _function(member)
-        if function is None or not inspect.getdoc(function):
-            continue
+        if function is None or not function.__doc__:
+            continue  # what a base class describes is described there
         if isinstance(member, property):
             head = f"`.{name}` -> `{_plain(function.__annotations__.get('return', '?'))}`"
         else:
@@ -98,9 +99,10 @@ def _value(value: object) -> str:
 
 
 def _function(member: object):
+    """The function behind a method or a property; None for anything else."""
     for inner in (getattr(member, "fget", None), getattr(member, "__func__", None), member):
-        if inspect.isfunction(inspect.unwrap(inner)) if callable(inner) else False:
-            return inspect.unwrap(inner)
+        if callable(inner) and inspect.isfunction(function := inspect.unwrap(inner)):
+            return function
     return None
 
 
@@ -122,11 +124,14 @@ def _plain(annotation: object) -> str:
     """A type as one would write it, without the modules of its parts."""
     if isinstance(annotation, str):
         return annotation
-    known = {getattr(marlyap, n): n for n in ("Action", "Obs", "Links", "Key")}
+    if annotation == marlyap.Key:
+        return "Key"
+    known = {getattr(marlyap, n): n for n in ("Action", "Obs", "Links")}
     if inspect.isclass(annotation):
-        return known.get(annotation, annotation.__name__)
+        name = known.get(annotation, annotation.__name__)
+        return re.sub(r"\b(?:\w+\.)+(?=\w)", "", name)
     text = inspect.formatannotation(annotation)
-    return __import__("re").sub(r"\b(?:\w+\.)+(?=\w)", "", text).strip("'")
+    return re.sub(r"\b(?:\w+\.)+(?=\w)", "", text).strip("'")
 
 
 def _prose(thing) -> str:

@@ -92,7 +92,7 @@ def _remedy(error: Exception) -> str:
         return "use jnp (jax.numpy) instead of NumPy"
     if isinstance(error, (jax.errors.JAXTypeError, jax.errors.JAXIndexError)):
         return "use jnp.where, not if or float()"
-    if isinstance(error, TypeError) and said.startswith("State.__init__()"):
+    if isinstance(error, TypeError) and ("State.__init__()" in said or "'scenario'" in said):
         return "return State(x=..., scenario=..., t=jnp.asarray(0)), goals in the scenario"
     if isinstance(error, TypeError) and "argument" in said:
         return "keep the arguments of the base class"

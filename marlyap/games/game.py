@@ -302,7 +302,7 @@ class AbstractRegulation(AbstractGame):
     def distance(self, state: State) -> Float[Array, "agent"]:
         """The largest of an agent's errors, each in units of its tolerance."""
         most = jnp.array([e.most for e in self.tolerances])
-        return jnp.max(jnp.abs(self.errors(state)) / most, axis=1)
+        return jnp.max(jnp.abs(self.errors(state)) / most[None], axis=1)
 
     def features(self, state: State) -> Features:
         """The errors, and those that are judged once more, magnified: e / (|e| + tolerance)."""
@@ -310,7 +310,7 @@ class AbstractRegulation(AbstractGame):
         judged = np.flatnonzero(np.isfinite([e.most for e in self.tolerances]))
         most = jnp.array([self.tolerances[k].most for k in judged])
         some = errors[:, judged]
-        return jnp.concatenate([errors, some / (jnp.abs(some) + most)], axis=1)
+        return jnp.concatenate([errors, some / (jnp.abs(some) + most[None])], axis=1)
 
     def farther(self, state: State, factor: float | Array) -> State:
         """The start with its distances from the target set multiplied by `factor`."""
