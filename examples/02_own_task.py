@@ -6,12 +6,21 @@ From the command line: marlyap train examples/02_own_task.py:Corner masac
 import jax
 import jax.numpy as jnp
 
-from marlyap import MASAC, AbstractGame, Schedule, State, Unicycle, evaluate, train
-from marlyap.games.dynamics import AbstractDynamics
+from marlyap import (
+    MASAC,
+    AbstractDynamics,
+    AbstractPlanar,
+    Goals,
+    Schedule,
+    State,
+    Unicycle,
+    evaluate,
+    train,
+)
 from marlyap.tasks.rendezvous import scatter
 
 
-class Corner(AbstractGame):
+class Corner(AbstractPlanar):
     """The goal is one of the four corners; only agent 0 knows which one."""
 
     agents: int = 3
@@ -27,7 +36,7 @@ class Corner(AbstractGame):
         k_start, k_corner = jax.random.split(key)
         start = scatter(self.dynamics, self.agents, self.size, k_start)
         corner = self.size * jax.random.rademacher(k_corner, (2,), jnp.float32)
-        return State(x=start.x, goal=jnp.tile(corner, (self.agents, 1)), t=start.t)
+        return State(x=start.x, scenario=Goals(jnp.tile(corner, (self.agents, 1))), t=start.t)
 
     def observe(self, state, links):
         return self.local_view(state, links)

@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     from marlyap.certificates.certificate import AbstractCertificate as AbstractCertificate
     from marlyap.certificates.certify import certify as certify
     from marlyap.certificates.lyapunov import AbstractLyapunov as AbstractLyapunov
-    from marlyap.controllers import AbstractController as AbstractController
+    from marlyap.conformance import conformance as conformance
+    from marlyap.controllers import AbstractController as AbstractController, as_action as as_action
     from marlyap.errors import UserError as UserError
     from marlyap.games.dynamics import (
         AbstractDynamics as AbstractDynamics,
@@ -25,33 +26,67 @@ if TYPE_CHECKING:
         AbstractRegulation as AbstractRegulation,
         Tolerance as Tolerance,
     )
+    from marlyap.games.perturbed import Perturbed as Perturbed
     from marlyap.games.physics import AbstractPlant as AbstractPlant
     from marlyap.games.planar import AbstractPlanar as AbstractPlanar, Goals as Goals
-    from marlyap.learning.algorithm import AbstractAlgorithm as AbstractAlgorithm
-    from marlyap.learning.algorithms import APG as APG, MASAC as MASAC
+    from marlyap.games.sensing import beside as beside, beside_entries as beside_entries
+    from marlyap.learning.algorithm import (
+        AbstractAlgorithm as AbstractAlgorithm,
+        AbstractFromData as AbstractFromData,
+    )
+    from marlyap.learning.algorithms import (
+        APG as APG,
+        MADDPG as MADDPG,
+        MASAC as MASAC,
+        CentralisedSAC as CentralisedSAC,
+        DecentralisedSAC as DecentralisedSAC,
+    )
     from marlyap.learning.constraint import AbstractConstraint as AbstractConstraint
     from marlyap.learning.constraints import Lyapunov as Lyapunov, Unconstrained as Unconstrained
     from marlyap.learning.off_policy import AbstractOffPolicy as AbstractOffPolicy
     from marlyap.learning.on_policy import AbstractOnPolicy as AbstractOnPolicy
+    from marlyap.learning.replay import Episode as Episode
     from marlyap.learning.schedule import Schedule as Schedule
-    from marlyap.learning.source import AbstractSource as AbstractSource, Simulated as Simulated
+    from marlyap.learning.source import (
+        AbstractSource as AbstractSource,
+        CostWindow as CostWindow,
+        Play as Play,
+        Simulated as Simulated,
+    )
     from marlyap.learning.trainer import Trainer as Trainer
     from marlyap.runs.fit import train as train
     from marlyap.runs.launch import Launch as Launch, launch as launch
-    from marlyap.runs.run import Run as Run
-    from marlyap.simulation.evaluation import compare as compare, evaluate as evaluate
-    from marlyap.simulation.rollout import Decentralised as Decentralised, rollout as rollout
+    from marlyap.runs.run import Run as Run, load_policy as load_policy
+    from marlyap.simulation.evaluation import (
+        Evaluation as Evaluation,
+        compare as compare,
+        evaluate as evaluate,
+    )
+    from marlyap.simulation.rollout import (
+        AbstractExplorer as AbstractExplorer,
+        Decentralised as Decentralised,
+        rollout as rollout,
+    )
     from marlyap.tasks import Formation as Formation, Rendezvous as Rendezvous
-    from marlyap.types import State as State
+    from marlyap.types import (
+        Action as Action,
+        Entry as Entry,
+        Key as Key,
+        Links as Links,
+        Obs as Obs,
+        Scene as Scene,
+        State as State,
+        Trajectory as Trajectory,
+        Transition as Transition,
+    )
 
 PUBLIC = {
-    "learning.algorithm": ("AbstractAlgorithm",),
-    "learning.algorithms": ("APG", "MASAC"),
     "certificates.certificate": ("AbstractCertificate",),
     "certificates.certify": ("certify",),
-    "learning.constraint": ("AbstractConstraint",),
-    "learning.constraints": ("Lyapunov", "Unconstrained"),
-    "controllers": ("AbstractController",),
+    "certificates.lyapunov": ("AbstractLyapunov",),
+    "conformance": ("conformance",),
+    "controllers": ("AbstractController", "as_action"),
+    "errors": ("UserError",),
     "games.dynamics": (
         "AbstractDynamics",
         "DoubleIntegrator",
@@ -59,23 +94,38 @@ PUBLIC = {
         "SingleIntegrator",
         "Unicycle",
     ),
-    "errors": ("UserError",),
-    "simulation.evaluation": ("compare", "evaluate"),
-    "runs.fit": ("train",),
     "games.game": ("AbstractGame", "AbstractRegulation", "Tolerance"),
+    "games.perturbed": ("Perturbed",),
     "games.physics": ("AbstractPlant",),
     "games.planar": ("AbstractPlanar", "Goals"),
-    "certificates.lyapunov": ("AbstractLyapunov",),
+    "games.sensing": ("beside", "beside_entries"),
+    "learning.algorithm": ("AbstractAlgorithm", "AbstractFromData"),
+    "learning.algorithms": ("APG", "CentralisedSAC", "DecentralisedSAC", "MADDPG", "MASAC"),
+    "learning.constraint": ("AbstractConstraint",),
+    "learning.constraints": ("Lyapunov", "Unconstrained"),
     "learning.off_policy": ("AbstractOffPolicy",),
     "learning.on_policy": ("AbstractOnPolicy",),
-    "simulation.rollout": ("Decentralised", "rollout"),
-    "runs.run": ("Run",),
-    "runs.launch": ("Launch", "launch"),
+    "learning.replay": ("Episode",),
     "learning.schedule": ("Schedule",),
-    "learning.source": ("AbstractSource", "Simulated"),
-    "tasks": ("Formation", "Rendezvous"),
+    "learning.source": ("AbstractSource", "CostWindow", "Play", "Simulated"),
     "learning.trainer": ("Trainer",),
-    "types": ("State",),
+    "runs.fit": ("train",),
+    "runs.launch": ("Launch", "launch"),
+    "runs.run": ("Run", "load_policy"),
+    "simulation.evaluation": ("Evaluation", "compare", "evaluate"),
+    "simulation.rollout": ("AbstractExplorer", "Decentralised", "rollout"),
+    "tasks": ("Formation", "Rendezvous"),
+    "types": (
+        "Action",
+        "Entry",
+        "Key",
+        "Links",
+        "Obs",
+        "Scene",
+        "State",
+        "Trajectory",
+        "Transition",
+    ),
 }
 _HOME = {name: module for module, names in PUBLIC.items() for name in names}
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]

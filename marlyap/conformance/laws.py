@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array
 
 from marlyap.controllers import UniformlyRandom
-from marlyap.errors import first_line, raised_at
+from marlyap.errors import UserError, first_line, raised_at
 from marlyap.games.game import AbstractGame, AbstractRegulation
 from marlyap.simulation.rollout import rollout
 from marlyap.types import Action, Key, Keys, State, Trajectory, by_agent
@@ -78,10 +78,25 @@ def _caught(law: Callable[[], Faults]) -> Faults:
 
 
 def _raised(method: str, error: Exception) -> str:
-    traced = isinstance(error, (jax.errors.JAXTypeError, jax.errors.JAXIndexError))
-    remedy = "use jnp.where, not if or float()" if traced else "make it return for every state"
+    if isinstance(error, UserError):
+        return f"{method}: {error}"
+    remedy = _remedy(error)
     place = f" at {place}" if (place := raised_at(error)) else ""
     return f"{method}: it raised {first_line(error)}{place}; {remedy}."
+
+
+def _remedy(error: Exception) -> str:
+    """What the mistake usually is behind an error of this kind."""
+    said = str(error)
+    if isinstance(error, jax.errors.TracerArrayConversionError):
+        return "use jnp (jax.numpy) instead of NumPy"
+    if isinstance(error, (jax.errors.JAXTypeError, jax.errors.JAXIndexError)):
+        return "use jnp.where, not if or float()"
+    if isinstance(error, TypeError) and ("State.__init__()" in said or "'scenario'" in said):
+        return "return State(x=..., scenario=..., t=jnp.asarray(0)), goals in the scenario"
+    if isinstance(error, TypeError) and "argument" in said:
+        return "keep the arguments of the base class"
+    return "make it return for every state"
 
 
 # --- What is examined -----------------------------------------------------------------------------
@@ -289,7 +304,7 @@ def shapes(game: AbstractGame) -> Faults:
         yield _raised("reset", error)
         return
     if not isinstance(state, State):
-        kind = type(state).__name__
+        kind = "plain array" if hasattr(state, "dtype") else type(state).__name__
         yield f"reset: it returns a {kind}; return State(x=..., scenario=..., t=jnp.asarray(0))."
         return
     wrong = list(_caught(lambda: _wrong_state(game, state)))
@@ -320,6 +335,9 @@ def shapes(game: AbstractGame) -> Faults:
             )
         except Exception as error:
             yield _raised(name, error)
+    if fault := _field(game, state, action):
+        yield fault
+        return
     try:
         after = eqx.filter_eval_shape(game.step, state, action)
     except Exception as error:
@@ -333,6 +351,24 @@ def shapes(game: AbstractGame) -> Faults:
         if (old.shape, old.dtype) != (new.shape, new.dtype):
             name = jax.tree_util.keystr(path).lstrip(".")
             yield f"step: {name} becomes {_text(new)} from {_text(old)}; keep shape and type."
+
+
+def _field(game: AbstractGame, state: State, action: Any) -> str | None:
+    """A fault where the plant's rates have another shape than its states."""
+    inputs = eqx.filter_eval_shape(game.plant.inputs_of, action)
+    time = jax.ShapeDtypeStruct((), jnp.float32)
+    try:
+        rates = eqx.filter_eval_shape(game.plant.field, state.x, inputs, state.scenario, time)
+    except Exception as error:
+        return _raised("field", error)
+    old, new = (jax.tree.map(lambda leaf: leaf.shape, tree) for tree in (state.x, rates))
+    if old != new:
+        return f"field: it returns {_all(rates)}; return the shape of x, {_all(state.x)}."
+    return None
+
+
+def _all(tree: Any) -> str:
+    return ", ".join(map(_text, jax.tree.leaves(tree)))
 
 
 def _wrong_state(game: AbstractGame, state: State) -> Faults:

@@ -68,10 +68,8 @@ def check_inputs(
     """Raise UserError unless each input has one positive limit and the integrator is known."""
     traced = not all(isinstance(u, (int, float)) for u in limits)  # scaled inside jit
     if len(limits) != len(inputs) or not (traced or all(0 < u < 1e6 for u in limits)):
-        raise UserError(
-            f"limits: {limits} must be {len(inputs)} positive numbers, the largest "
-            f"{' and '.join(inputs)}."
-        )
+        numbers = "one positive number" if len(inputs) == 1 else f"{len(inputs)} positive numbers"
+        raise UserError(f"limits: {limits} must be {numbers}, the largest {' and '.join(inputs)}.")
     if integrator not in ("euler", "rk4"):
         raise UserError(f"integrator: '{integrator}' must be euler or rk4.")
 

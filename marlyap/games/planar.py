@@ -69,7 +69,15 @@ class AbstractPlanar(AbstractRegulation):
         return (*gap, *(Tolerance(name, units.get(name, "?"), frame="own") for name in d.felt))
 
     def goals(self, state: State) -> Float[Array, "agent 2"]:
-        """Where each agent has to be in this state (m)."""
+        """Where each agent has to be in this state (m); may depend on scenario and t.
+
+        Raises UserError if the scenario holds no `goal`.
+        """
+        if not hasattr(state.scenario, "goal"):
+            raise UserError(
+                f"scenario: {type(self).__name__} puts no goal into it; return scenario=Goals("
+                "goal) from reset, or override goals(state)."
+            )
         return state.scenario.goal
 
     def positions(self, state):

@@ -322,9 +322,25 @@ def _construct(cls: type[T], values: dict[str, Any], where: str) -> T:
     except UserError as error:
         raise UserError(f"{where}.{error}" if where and ":" not in where else str(error)) from None
     except Exception as error:  # whatever the constructor of a user's class may raise
+        if missing := _missing(cls, values):
+            raise UserError(f"{where or cls.__name__}: {missing}.") from None
         place = raised_at(error)
         said = f"{place}: {first_line(error)}" if place else f"{error}"
         raise UserError(f"{where or cls.__name__}: {said}.") from error
+
+
+def _missing(cls: type, values: Mapping[str, Any]) -> str | None:
+    """What a class must define and does not, or which field has no value."""
+    abstract = ("__abstractmethods__", "__abstractvars__", "__abstractclassvars__")
+    lacks = sorted({str(n) for kind in abstract for n in getattr(cls, kind, ())})
+    if lacks:
+        return f"it lacks {' and '.join(lacks)}; define {'them' if len(lacks) > 1 else 'it'}"
+    given = dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ()
+    unset = dataclasses.MISSING
+    bare = [f.name for f in given if f.init and f.default is unset and f.default_factory is unset]
+    if bare := [name for name in bare if name not in values]:
+        return f"the field {bare[0]} has no default; give it one"
+    return None
 
 
 def _parse(text: str, hint: Any, where: str) -> Any:

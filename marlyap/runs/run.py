@@ -282,6 +282,22 @@ class Run:
         store.write_text_atomic(self.directory / "log.jsonl", text)
 
 
+def load_policy(directory: Path | str, task: AbstractGame | str | None = None) -> Decentralised:
+    """The policy that a run deploys, ready to act.
+
+    Arguments: directory, of the run; task, the run's task where it is code of your own: the object,
+    or path/to/file.py:Name, which is executed.
+
+    `load_policy(...).policy(obs, key)` takes what the agents observe [agent, obs] and gives actions
+    [agent, input] in [-1, 1]; times `game.plant.limits` they are inputs in their units. Row i
+    follows from row i alone, and what `obs` holds is told by `game.entries()`. Called with a State
+    and a key it is a controller of the run's game.
+    Raises UserError if the directory is no run, has no policy yet, or needs `task`.
+    """
+    game = config.load(task, AbstractGame) if isinstance(task, str) else task
+    return Run.open(directory, game).controller()
+
+
 def _recorded(code: Any, part: str, where: str, own: Iterable[str]) -> dict[str, Any]:
     """What run.json says of the user's code in one part; old ones say nothing, all is `own`."""
     if code is None:
