@@ -1,6 +1,6 @@
 """Write docs/reference.md from the docstrings of everything that `marlyap` exports.
 
-    ./run python docs/make_reference.py
+./run python docs/make_reference.py
 """
 
 import dataclasses
