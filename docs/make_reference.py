@@ -14,16 +14,23 @@ import marlyap
 PAGE = Path(__file__).parent / "reference.md"
 HEAD = """# Reference
 
-Everything that `from marlyap import ...` offers, by the module it comes from. Made from the docstrings
-by `./run python docs/make_reference.py`; do not edit. Shapes are written as in
-`Float[Array, "agent 2"]`: one row of two numbers for each agent. What no section describes is private and
-may change.
+Everything that `from marlyap import ...` offers, by the module it comes from. Made from the
+docstrings by `./run python docs/make_reference.py`; do not edit. Shapes are written as in
+`Float[Array, "agent 2"]`: one row of two numbers for each agent.
 """
+ALIASES = {
+    "Union[Key[Array, ''], UInt32[Array, '2'], UInt32[Array, '4']]": "Key",
+    "Float[Array, 'agent du']": "Action",
+    "Float[Array, 'agent obs']": "Obs",
+    "Bool[Array, 'agent agent']": "Links",
+    "Float[Array, '']": "Scalar",
+    "Callable[[State, Key], Action]": "Controller",
+    "Callable[[Obs, Key], Action]": "Policy",
+}
 SECTIONS = {
     "games": "Tasks and plants",
     "tasks": "Built-in tasks",
     "types": "States, actions, observations",
-    "conformance": "Checking a task",
     "learning": "Learning",
     "runs": "Training and runs on disk",
     "simulation": "Playing and measuring",
@@ -51,7 +58,8 @@ def _entry(name: str, module: str) -> str:
     elif inspect.isfunction(thing):
         lines += [f"```\n{_signature(name, thing)}\n```\n", _prose(thing)]
     else:
-        lines.append(f"The type `{_plain(thing)}`.\n")
+        text = re.sub(r"\b(?:\w+\.)+(?=\w)", "", inspect.formatannotation(thing))
+        lines.append(f"The type `{text}`.\n")
     return "\n".join(lines)
 
 
@@ -95,6 +103,8 @@ def _of(cls: type) -> tuple:
 
 
 def _value(value: object) -> str:
+    if inspect.isroutine(value):
+        return value.__name__
     return f"{type(value).__name__}()" if dataclasses.is_dataclass(value) else repr(value)
 
 
@@ -121,17 +131,12 @@ def _signature(name: str, function) -> str:
 
 
 def _plain(annotation: object) -> str:
-    """A type as one would write it, without the modules of its parts."""
-    if isinstance(annotation, str):
-        return annotation
-    if annotation == marlyap.Key:
-        return "Key"
-    known = {getattr(marlyap, n): n for n in ("Action", "Obs", "Links")}
-    if inspect.isclass(annotation):
-        name = known.get(annotation, annotation.__name__)
-        return re.sub(r"\b(?:\w+\.)+(?=\w)", "", name)
-    text = inspect.formatannotation(annotation)
-    return re.sub(r"\b(?:\w+\.)+(?=\w)", "", text).strip("'")
+    """A type as one would write it: without the modules of its parts, long ones by their names."""
+    text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
+    text = re.sub(r"\b(?:\w+\.)+(?=\w)", "", text).strip("'")
+    for long, short in ALIASES.items():
+        text = text.replace(long, short)
+    return text
 
 
 def _prose(thing) -> str:

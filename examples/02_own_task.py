@@ -6,17 +6,8 @@ From the command line: marlyap train examples/02_own_task.py:Corner masac
 import jax
 import jax.numpy as jnp
 
-from marlyap import (
-    MASAC,
-    AbstractDynamics,
-    AbstractPlanar,
-    Goals,
-    Schedule,
-    State,
-    Unicycle,
-    evaluate,
-    train,
-)
+from marlyap import MASAC, AbstractPlanar, Goals, Schedule, State, Unicycle, evaluate, train
+from marlyap.games.dynamics import AbstractDynamics
 from marlyap.tasks.rendezvous import scatter
 
 

@@ -4,8 +4,7 @@ import argparse
 from itertools import count
 from pathlib import Path
 
-from marlyap import MASAC, Lyapunov, Rendezvous, Run, Schedule, Trainer
-from marlyap.runs import launch
+from marlyap import MASAC, Lyapunov, Rendezvous, Run, Schedule, Trainer, launch
 from marlyap.runs.events import Progress
 
 

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from marlyap.certificates.certificate import AbstractCertificate as AbstractCertificate
     from marlyap.certificates.certify import certify as certify
     from marlyap.certificates.lyapunov import AbstractLyapunov as AbstractLyapunov
-    from marlyap.conformance import conformance as conformance
     from marlyap.controllers import AbstractController as AbstractController, as_action as as_action
     from marlyap.errors import UserError as UserError
     from marlyap.games.dynamics import (
@@ -84,7 +83,6 @@ PUBLIC = {
     "certificates.certificate": ("AbstractCertificate",),
     "certificates.certify": ("certify",),
     "certificates.lyapunov": ("AbstractLyapunov",),
-    "conformance": ("conformance",),
     "controllers": ("AbstractController", "as_action"),
     "errors": ("UserError",),
     "games.dynamics": (

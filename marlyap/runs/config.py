@@ -209,7 +209,7 @@ def named_by(obj: Any) -> dict[str, type]:
     beside = {
         value.__name__: value
         for module in modules
-        for value in vars(module).values()
+        for value in (vars(module).values() if module else ())  # none for code that was executed
         if inspect.isclass(value) and issubclass(value, eqx.Module) and not _ours(value)
     }
     return beside | used
