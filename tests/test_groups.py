@@ -27,7 +27,23 @@ def outcome(successes, episodes=20):
     still, far = np.zeros(episodes), np.where(good, 0.02, 0.4)
     times = np.where(good, 1.0, np.inf)
     broken = np.zeros(episodes, bool)
-    return Evaluation(good, far, good, good, still, still, times, broken, -far, 0.1, 360)
+    return Evaluation(
+        successes=good,
+        failed=broken,
+        final=far,
+        held=good,
+        stayed=good,
+        speed=still,
+        spin=still,
+        settled=times,
+        violated=broken,
+        total=-far,
+        cost=far,
+        edge=0.1,
+        unit="m",
+        mapped=True,
+        beyond=360,
+    )
 
 
 def made(place, seed=0, successes=15, game=None, algorithm=None, asked=None, starts=0, **about):

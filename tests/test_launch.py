@@ -6,10 +6,10 @@ import json
 import jax
 import pytest
 
-from marlyap import Launch, Rendezvous, Run, Schedule, Trainer, UserError
+from marlyap import Launch, Rendezvous, Run, Schedule, Trainer, UserError, launch
 from marlyap.games.dynamics import SingleIntegrator
 from marlyap.learning.algorithms import MASAC
-from marlyap.runs import events, launch, launch as launching
+from marlyap.runs import events, launch as launching
 from marlyap.runs.job import Job
 from marlyap.runs.stop import Stop
 

@@ -29,7 +29,7 @@ from marlyap.storage.store import MANIFEST, PAYLOAD, Checkpoints, CorruptError
 
 KILLS = int(os.environ.get("MARLYAP_KILLS", "15"))
 TRIALS = 200
-ROOT = Path(store.__file__).parents[1]
+ROOT = Path(store.__file__).parents[2]
 NUMBER = np.random.default_rng(0)
 fuzz = settings(
     max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]

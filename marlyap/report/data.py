@@ -57,6 +57,7 @@ class Figures(Share):
     final_spin: Quantiles = field(default_factory=dict)  # rad/s
     settling_time: Quantiles = field(default_factory=dict)  # s
     return_mean: Number = None  # of an episode
+    cost_mean: Number = None  # of the team, mean over steps and episodes
     rests: str = ""  # what a team does once it has arrived, in words
 
 

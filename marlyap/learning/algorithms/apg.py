@@ -14,8 +14,8 @@ see no more than those of MASAC, but the trainer must have the equations of moti
 
 With `weight` > 0 the policy is also held to the paper's decrease condition in its finite-step form:
 with L(s_t) the sum of the next T costs, L(s_{t+1}) - L(s_t) = c_{t+T} - c_t, so Delta_t = 0 says
-that L falls by `decrease` c_t at s_t. It is asked for where c_t exceeds the cost at the edge of success (certificate C3
-tests the same).
+that L falls by `decrease` c_t at s_t. It is asked for where c_t exceeds the cost at the edge of
+success (certificate C3 tests the same).
 """
 
 import equinox as eqx
@@ -102,7 +102,7 @@ class APG(AbstractAlgorithm):
         return J, (path.cost, path.reward)
 
     def rise(self, c: Float[Array, "time"], game: AbstractGame) -> Scalar:
-        """The mean over t of Delta_t, where the team's cost c_t exceeds that at the edge of success."""
+        """The mean over t of Delta_t, where the team's cost c_t exceeds that at the edge."""
         T = min(self.T, c.shape[0] - 1)
         now, ahead = c[:-T], c[T:]
         delta = jax.nn.relu(ahead - (1 - self.decrease) * now)
