@@ -20,12 +20,14 @@ from marlyap.games.planar import Goals
 from marlyap.runs.config import load_controller
 from marlyap.simulation.evaluation import evaluate
 from marlyap.simulation.rollout import rollout
-from marlyap.tasks.rendezvous import Rendezvous
+from marlyap.tasks import CartPoles, Microgrid, Rendezvous
 from marlyap.types import State
 
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
-LAWS = [name for name in CONTROLLERS if name not in ("optimal-control", "zero", "uniform")]
+LAWS = ["point-offset", "gradient-consensus", "lin-francis-maggiore", "tree-pursuit"]
+OTHERS = {"cart-lqr": CartPoles(), "cart-feedback": CartPoles(), "grid-feedback": Microgrid()}
+ANY = ("zero", "hold", "uniform")
 every_law = pytest.mark.parametrize("name", LAWS)
 PATH = Rendezvous(agents=5, graph="path")
 STRONG = Rendezvous(agents=5, graph="path", dynamics=Unicycle(limits=(1e4, 1e4)))  # unsaturated

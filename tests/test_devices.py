@@ -14,6 +14,7 @@ from jax.sharding import PartitionSpec as P
 from conftest import keep_compiled_code
 from marlyap import MASAC, Rendezvous, Schedule, Trainer
 from marlyap.compute import devices
+from marlyap.runs.events import Progress
 from marlyap.runs.fit import fit
 from marlyap.runs.run import Run, flatten
 
@@ -48,7 +49,7 @@ trainer = Trainer(Rendezvous(horizon=2), algorithm, plan)
 
 def trained(folder):
     runs = [Run.create(folder / str(s), trainer, s, {}) for s in (0, 1)]
-    log = list(fit(runs))
+    log = [event for event in fit(runs) if isinstance(event, Progress)]
     policies = [flatten(run.deployed()) for run in runs]
     carries = [flatten(run.load()[0]) for run in runs]
     return log, policies, carries

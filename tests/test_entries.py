@@ -73,7 +73,7 @@ def test_every_entry_of_every_task_has_a_name_and_a_unit(name):
         entries, state = game.entries(), game.reset(jax.random.key(0))
         assert len(entries["observation"]) == game.observations(state).shape[1]
         assert len(entries["state"]) == state.x.shape[1]
-        assert len(entries["action"]) == game.dynamics.du
+        assert len(entries["action"]) == game.du
         for entry in (e for part in entries.values() for e in part):
             assert (
                 entry.name and entry.unit not in ("", "?") and entry.frame in ("own", "world", "")

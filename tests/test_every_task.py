@@ -11,6 +11,7 @@ import pytest
 from marlyap.conformance.laws import LAWS, conformance, see
 from marlyap.errors import UserError
 from marlyap.games.dynamics import DoubleIntegrator, LateUnicycle, SingleIntegrator, Unicycle
+from marlyap.games.planar import AbstractPlanar
 from marlyap.games.sensing import near
 from marlyap.simulation.rollout import Decentralised, Uniform, rollout
 from marlyap.tasks import TASKS
@@ -29,7 +30,9 @@ VARIANTS = {
     "alone": Rendezvous(agents=1),
 }
 GAMES = VARIANTS | {f"TASKS[{k}]": g for k, g in TASKS.items() if g not in VARIANTS.values()}
+PLANAR = {k: g for k, g in GAMES.items() if isinstance(g, AbstractPlanar)}
 every_game = pytest.mark.parametrize("game", GAMES.values(), ids=GAMES)
+every_planar_game = pytest.mark.parametrize("game", PLANAR.values(), ids=PLANAR)
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
@@ -100,6 +103,45 @@ def test_the_laws_of_the_library_are_kept(game):
 
 
 @every_game
+def test_the_target_set_is_kept_by_the_action_that_holds_it(game):
+    """There the errors, the cost and the distance are 0, no rule is broken, and `hold` keeps it."""
+
+    @eqx.filter_jit
+    def there(key):
+        state = game.at_target(game.reset(key))
+        action = game.hold(state)
+        after = game.step(state, action)
+        size = jnp.max(jnp.abs(state.x), axis=0)
+        close = jnp.abs(game.errors(after)) <= 1e-5 * (1 + jnp.max(size))
+        zero = [game.errors(state), game.distance(state), game.costs(state, action)]
+        return game.success(state), game.failed(state), jnp.all(close), zero
+
+    for seed in range(4):
+        success, failed, close, zero = there(jax.random.key(seed))
+        assert success and not failed and close
+        for values in zero:
+            np.testing.assert_allclose(values, 0, atol=1e-9)
+
+
+@every_game
+def test_success_ends_at_the_edge(game):
+    """Where an agent's miss is above 1 the team has not succeeded; it has where none is."""
+
+    @eqx.filter_jit
+    def seen(keys):
+        def one(key, far):
+            state = game.farther(game.reset(key), far)
+            return game.miss(state), game.success(state), game.failed(state)
+
+        return jax.vmap(one)(keys, jnp.geomspace(1e-4, 1.0, 64))
+
+    miss, success, failed = map(np.asarray, seen(jax.random.split(jax.random.key(5), 64)))
+    np.testing.assert_array_equal(success, (miss <= 1).all(axis=1) & ~failed)
+    if not isinstance(game, AbstractPlanar):  # whose starts move about the origin, not the goals
+        assert success[0] and not success[-1]
+
+
+@every_planar_game
 def test_the_target_set_is_an_equilibrium_without_cost(game):
     """t10, first half: there the cost and the errors are 0 exactly, and stay so."""
     states, actions = draw(game, jax.random.key(1))
@@ -112,7 +154,7 @@ def test_the_target_set_is_an_equilibrium_without_cost(game):
     np.testing.assert_array_equal(out["next"].scenario.goal, there.scenario.goal)
 
 
-@every_game
+@every_planar_game
 def test_errors_are_zero_nowhere_else(game):
     """Moving any one agent a little in any but its heading shows in its errors, and only there."""
     states, actions = draw(game, jax.random.key(3))
@@ -125,7 +167,7 @@ def test_errors_are_zero_nowhere_else(game):
             np.testing.assert_array_equal(changed, np.broadcast_to(want, changed.shape))
 
 
-@every_game
+@every_planar_game
 def test_success_is_all_agents_within_the_radius(game):
     states, actions = draw(game, jax.random.key(4))
     there = target(game, states, jax.random.key(2))
@@ -136,7 +178,7 @@ def test_success_is_all_agents_within_the_radius(game):
         np.testing.assert_allclose(off["distance"][:, i], 1.05 * game.radius, rtol=1e-3)
 
 
-@every_game
+@every_planar_game
 def test_observations_are_local(game):
     """t5: row i changes with agent j exactly if they are linked, to the last bit (section 2.9)."""
     states, actions = draw(game, jax.random.key(5))
@@ -158,7 +200,7 @@ def test_observations_are_local(game):
         assert kinds == {True, False}
 
 
-@every_game
+@every_planar_game
 def test_only_leaders_see_their_goal(game):
     states, actions = draw(game, jax.random.key(6))
     before = look(game, states, actions)["obs"]
@@ -184,7 +226,7 @@ def carried(game, states, angle, shift):
     return moved(states, x, np.array(states.scenario.goal, np.float64) @ turn.T + shift)
 
 
-@every_game
+@every_planar_game
 def test_no_compass_and_no_map(game):
     """t6: a turn and a shift of the whole scene change nothing, and the motion follows.
 
@@ -266,7 +308,7 @@ def test_near_magnifies():
     assert np.isfinite(jax.jacobian(lambda v: near(v, 0.1))(jnp.zeros(2))).all()
 
 
-@every_game
+@every_planar_game
 def test_episodes_start_at_rest_in_the_box_and_differ(game):
     keys = jax.random.split(jax.random.key(9), 64)
     s, again = resets(game, keys), resets(game, keys)

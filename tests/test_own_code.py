@@ -30,7 +30,9 @@ BROKEN = {
     "costs(self, state, action): return jnp.mean(self.distance(state))": ["float32[]"],
     "costs(self, state, action): return self.distance(state)[:, None]": ["float32[3, 1]"],
     "costs(self, state, action): return None": ["costs: it is a NoneType"],
-    "costs(self, state, action): return np.sqrt(np.asarray(self.distance(state)))": ["jnp.where"],
+    "costs(self, state, action): return np.sqrt(np.asarray(self.distance(state)))": [
+        "jnp (jax.numpy)"
+    ],
     "costs(self, state, action): return state.x[:, 0] if state.t > 1 else 0": ["jnp.where"],
     "observe(self, state, links): return jnp.zeros(3)": ["observe: it is float32[3]"],
     "observe(self, state, links): return jnp.zeros((3, 2), int)": ["observe: it is int32[3, 2]"],

@@ -1,7 +1,6 @@
 """Controllers that are not learnt, to compare with: built in, or in a file of your own."""
 
-from marlyap.controllers.cart_feedback import CartFeedback as CartFeedback
-from marlyap.controllers.cart_lqr import CartLQR as CartLQR
+from marlyap.controllers.cart_feedback import CartFeedback as CartFeedback, CartLQR as CartLQR
 from marlyap.controllers.cascade import Cascade as Cascade
 from marlyap.controllers.controller import (
     AbstractController as AbstractController,

@@ -4,8 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from marlyap.controllers.controller import left
-from marlyap.games.planar import AbstractPlanar
+from marlyap.controllers.controller import Robots, left
 
 
 class Cascade(eqx.Module):
@@ -34,7 +33,7 @@ class Cascade(eqx.Module):
     calm: float = 0.005  # distance within which the heading no longer matters (m)
 
     def __call__(
-        self, game: AbstractPlanar, x: Float[Array, "dx"], e: Float[Array, "2"]
+        self, game: Robots, x: Float[Array, "dx"], e: Float[Array, "2"]
     ) -> Float[Array, "du"]:
         """Inputs a (m/s^2) and r (rad/s^2) for the state x, not yet clipped to the limits."""
         (a_max, r_max), fastest = game.dynamics.limits, 1 / game.dt

@@ -10,8 +10,12 @@ from jaxtyping import Array, Float
 
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
+from marlyap.games.perturbed import Perturbed
 from marlyap.games.planar import AbstractPlanar
 from marlyap.types import Action, Key, State
+
+
+Robots = AbstractPlanar | Perturbed  # robots in the plane, disturbed or not
 
 
 class AbstractController(eqx.Module):
@@ -44,7 +48,7 @@ class AbstractController(eqx.Module):
         """
 
 
-def headings(game: AbstractPlanar, state: State) -> Float[Array, "agent 2"]:
+def headings(game: Robots, state: State) -> Float[Array, "agent 2"]:
     """h_i, the unit vector along each agent's forward axis."""
     return jax.vmap(game.dynamics.heading)(state.x)
 
@@ -55,7 +59,7 @@ def left(h: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
 
 
 def mean_pull(
-    game: AbstractPlanar, state: State, q: Float[Array, "agent 2"], leader_gain: float
+    game: Robots, state: State, q: Float[Array, "agent 2"], leader_gain: float
 ) -> Float[Array, "agent 2"]:
     """e_i = (sum_j (q_j - q_i) + b_i (p*_i - q_i)) / (sum_j 1 + b_i), j over the neighbours (m).
 
@@ -69,6 +73,6 @@ def mean_pull(
     return pull / jnp.where(weight > 0, weight, 1.0)[:, None]
 
 
-def as_action(game: AbstractPlanar, u: Float[Array, "agent du"]) -> Action:
-    """Physical inputs (m/s^2, rad/s^2) as an action: divided by their limits and clipped."""
-    return jnp.clip(u / jnp.asarray(game.dynamics.limits)[None], -1.0, 1.0)
+def as_action(game: AbstractGame, u: Float[Array, "agent du"]) -> Action:
+    """Physical inputs, in the units of the plant, as an action: over their limits, and clipped."""
+    return jnp.clip(u / jnp.asarray(game.plant.limits)[None], -1.0, 1.0)

@@ -3,9 +3,8 @@
 import jax
 
 from marlyap.controllers.cascade import Cascade
-from marlyap.controllers.controller import AbstractController, as_action, mean_pull
+from marlyap.controllers.controller import AbstractController, Robots, as_action, mean_pull
 from marlyap.games.dynamics import Unicycle
-from marlyap.games.planar import AbstractPlanar
 
 
 class GradientConsensus(AbstractController):
@@ -16,7 +15,7 @@ class GradientConsensus(AbstractController):
 
     drives = (Unicycle,)
 
-    game: AbstractPlanar
+    game: Robots
     leader_gain: float = 20.0  # b, weight of the goal against one neighbour
     cascade: Cascade = Cascade(near=0.11, near_angle=0.09, k_r=10.0, braking=0.43, alignment=1.25)
 

@@ -7,7 +7,7 @@ from marlyap.tasks.microgrid import ConverterRing, Microgrid
 
 
 class GridFeedback(AbstractController):
-    """u_i = V* + R P_i / V* - k_v (V_i - V*) - k_i (I_i - P_i / V*), of own measurements alone.
+    """Feedback u_i = V* + R P_i / V* - k_v (V_i - V*) - k_i (I_i - P_i / V*), all measured at i.
 
     The first two terms hold the bus at V* under the load P_i that is measured there. The gains were
     tuned for the cost of the nominal game by Nelder and Mead's method.

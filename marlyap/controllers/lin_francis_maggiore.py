@@ -2,9 +2,14 @@
 
 import jax.numpy as jnp
 
-from marlyap.controllers.controller import AbstractController, as_action, headings, mean_pull
+from marlyap.controllers.controller import (
+    AbstractController,
+    Robots,
+    as_action,
+    headings,
+    mean_pull,
+)
 from marlyap.games.dynamics import Unicycle
-from marlyap.games.planar import AbstractPlanar
 
 
 class LinFrancisMaggiore(AbstractController):
@@ -18,7 +23,7 @@ class LinFrancisMaggiore(AbstractController):
 
     drives = (Unicycle,)
 
-    game: AbstractPlanar
+    game: Robots
     gain: float = 1.0  # k (1/s)
     leader_gain: float = 1.0  # b, weight of the goal against one neighbour
     amplitude: float = 1.0  # of the turn rate (rad/s)

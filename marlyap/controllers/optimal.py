@@ -15,10 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from marlyap.controllers.controller import AbstractController
+from marlyap.controllers.controller import AbstractController, Robots
 from marlyap.errors import UserError
 from marlyap.games.dynamics import Unicycle
-from marlyap.games.planar import AbstractPlanar
 from marlyap.simulation.rollout import AbstractPlanner
 from marlyap.types import Action, Key, State
 
@@ -42,7 +41,7 @@ class OptimalControl(AbstractPlanner, AbstractController):
 
     drives = (Unicycle,)
 
-    game: AbstractPlanar
+    game: Robots
     miss: float = 1e2  # weight of the final distance (1/m^2)
     effort: float = 1e-4  # weight of the inputs (s^4/m^2 and s^4/rad^2)
 

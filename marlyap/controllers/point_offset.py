@@ -2,9 +2,15 @@
 
 import jax.numpy as jnp
 
-from marlyap.controllers.controller import AbstractController, as_action, headings, left, mean_pull
+from marlyap.controllers.controller import (
+    AbstractController,
+    Robots,
+    as_action,
+    headings,
+    left,
+    mean_pull,
+)
 from marlyap.games.dynamics import Unicycle
-from marlyap.games.planar import AbstractPlanar
 
 
 class PointOffset(AbstractController):
@@ -18,7 +24,7 @@ class PointOffset(AbstractController):
 
     drives = (Unicycle,)
 
-    game: AbstractPlanar
+    game: Robots
     offset: float = 0.015  # d (m), smaller than the radius of success
     leader_gain: float = 17.0  # b, weight of the goal against one neighbour
     k_p: float = 24.0  # 1/s^2

@@ -6,9 +6,8 @@ from jaxtyping import Array, Int
 
 from marlyap import graph as graphs
 from marlyap.controllers.cascade import Cascade
-from marlyap.controllers.controller import AbstractController, as_action, headings
+from marlyap.controllers.controller import AbstractController, Robots, as_action, headings
 from marlyap.games.dynamics import LateUnicycle, Unicycle
-from marlyap.games.planar import AbstractPlanar
 from marlyap.types import State
 
 
@@ -25,7 +24,7 @@ class TreePursuit(AbstractController):
 
     drives = (Unicycle, LateUnicycle)
 
-    game: AbstractPlanar
+    game: Robots
     margin: float = 1.9  # predicted stopping distance over the shortest possible
     cascade: Cascade = Cascade()
 

@@ -52,8 +52,8 @@ class NotOfThatKind(UserError):
 
 def known() -> dict[str, type]:
     """The classes that a record may name without anyone's leave."""
-    members = [type(o) for family in FAMILIES.values() for o in family.values()]
-    return {cls.__name__: cls for cls in [*members, Schedule]}
+    members = [o for family in FAMILIES.values() for o in family.values()]
+    return {cls.__name__: cls for o in members for cls in classes_in(o)} | {"Schedule": Schedule}
 
 
 def suggest(word: str, among: Iterable[str]) -> str:
@@ -188,15 +188,14 @@ def record(obj: Any) -> Any:
 
 def own_classes(obj: Any) -> dict[str, type]:
     """The classes in an object and its fields that are not marlyap's, outermost first."""
-    found: dict[str, type] = {}
-    if isinstance(obj, eqx.Module):
-        if not _ours(type(obj)):
-            found[type(obj).__name__] = type(obj)
-        obj = tuple(fields(obj).values())
-    if isinstance(obj, tuple):
-        for value in obj:
-            found |= own_classes(value)
-    return found
+    return {cls.__name__: cls for cls in classes_in(obj) if not _ours(cls)}
+
+
+def classes_in(obj: Any) -> list[type]:
+    """The class of a configured object and those of its fields, outermost first."""
+    inside = tuple(fields(obj).values()) if isinstance(obj, eqx.Module) else obj
+    found = [type(obj)] if isinstance(obj, eqx.Module) else []
+    return found + [c for v in inside for c in classes_in(v)] if isinstance(inside, tuple) else []
 
 
 def named_by(obj: Any) -> dict[str, type]:
@@ -276,7 +275,8 @@ def describe(obj: Any, prefix: str) -> list[tuple[str, str, str]]:
         note, choices = notes.get(name, ""), _choices(hints[name])
         if choices:
             note = f"{note}{'; ' * bool(note)}one of {', '.join(choices)}"
-        rows.append((f"{prefix}.{name}", show(value), note))
+        if not isinstance(value, eqx.Module) or _members(type(value)):  # else no choice has a name
+            rows.append((f"{prefix}.{name}", show(value), note))
         if isinstance(value, eqx.Module):
             rows += describe(value, f"{prefix}.{name}")
     return rows

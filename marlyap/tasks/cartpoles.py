@@ -89,7 +89,7 @@ class CartPoles(AbstractRegulation):
 
     agents: int = 5  # N
     graph: str = "path"  # who sees whom; the springs join neighbouring carts whatever it is
-    plant: CartPoleRow = CartPoleRow()
+    plant: CartPoleRow = CartPoleRow()  # pyright: ignore
     place: float = 0.05  # a cart within this of its place has arrived (m)
     angle: float = 0.02  # so has a pole that leans by no more (rad)
     most_place: float = 2.4  # beyond it the team has failed (m)

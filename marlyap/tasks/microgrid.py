@@ -86,7 +86,7 @@ class Microgrid(AbstractRegulation):
 
     agents: int = 6  # N
     graph: str = "ring"  # who sees whom; the lines form a ring whatever it is
-    plant: ConverterRing = ConverterRing()
+    plant: ConverterRing = ConverterRing()  # pyright: ignore
     reference: float = 48.0  # of every bus (V)
     near: float = 0.48  # a bus within this of the reference has arrived (V)
     low: float = 24.0  # below it the team has failed (V)
@@ -128,13 +128,13 @@ class Microgrid(AbstractRegulation):
         return state.scenario.at(state.t * self.dt)
 
     def reset(self, key):
-        k_power, k_x, k_change, k_grid = jax.random.split(key, 4)
+        k_power, k_x, k_change, k_time, k_grid = jax.random.split(key, 5)
         n, near = self.agents, lambda key, shape: jax.random.uniform(key, shape, minval=-1.0)
         line, capacitance = near(k_grid, (2, n))
         loads = Loads(
             power=self.power * (1 + self.power_spread * near(k_power, (n,))),
             change=self.load_step * near(k_change, (n,)),
-            changes=jax.random.uniform(k_change, ()) * self.horizon * self.dt,
+            changes=jax.random.uniform(k_time, ()) * self.horizon * self.dt,
             line=1 + self.line_spread * line,
             capacitance=1 + self.capacitance_spread * capacitance,
         )
