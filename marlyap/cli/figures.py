@@ -1,10 +1,10 @@
 """The figures of `evaluate`: measured, as rows of JSON, in the run, and as a table."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich import box
 from rich.console import Console
@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from marlyap.certificates.certificate import arrival
-from marlyap.certificates.safety import has_rules
+from marlyap.certificates.safety import rules
 from marlyap.cli.common import Overrides
 from marlyap.controllers import CONTROLLERS, names_a_controller
 from marlyap.errors import UserError
@@ -89,19 +89,28 @@ def show(result: dict[str, Any], found: Sequence[groups.Measured]) -> None:
     rows, teams = result["runs"], result["groups"]
     first, arrivals = rows[0], {arrival(m.game) for m in found}
     reached = arrivals.pop() if len(arrivals) == 1 else "as each task defines it"
-    ruled = any(has_rules(m.game) for m in found) or any(r["violations"]["successes"] for r in rows)
-    title = f"{first['episodes']} held-out starts of seed {result['start_seed']}; "
+    heads, table = _table(result, found)
     console = Console()
     console = console if console.is_terminal else Console(width=max(console.width, 110))
-    console.print(_table(title + f"success at the last step: {reached}", result, found, ruled))
-    console.print(
-        "success, rest (no agent above 0.1 m/s or 0.1 rad/s), stays (in every step until "
-        f"{1 + max(m.evaluation.beyond / m.game.horizon for m in found):g} horizons)"
-        + (", broken (episodes with a violation)" if ruled else "")
-        + ": % of the episodes; median and 95 %: worst final distance (m); m/s and rad/s: of the "
-        "fastest agent at the last step, median; settled: median time (s)\n",
-        highlight=False,
-    )
+    table.title = f"{first['episodes']} held-out starts of seed {result['start_seed']}; "
+    table.title += f"success at the last step: {reached}"
+    console.print(table)
+    units = {row["unit"] for row in rows}
+    unit = units.pop() if len(units) == 1 else "in the unit of each task"
+    horizons = 1 + max(m.evaluation.beyond / m.game.horizon for m in found)
+    legend = {
+        "failed": "failed (for good, as the task says)",
+        "rest": "rest (no agent above 0.1 m/s or 0.1 rad/s)",
+        "stays": f"stays (in every step until {horizons:g} horizons)",
+        "broken": "broken (episodes with a violation)",
+    }
+    told = ["success", *(text for head, text in legend.items() if head in heads)]
+    told = [f"{', '.join(told)}: % of the episodes", f"median and 95 %: worst final miss ({unit})"]
+    told += [
+        "cost: of a step, mean",
+        *["m/s and rad/s: of the fastest agent at the last step, median"] * ("m/s" in heads),
+    ]
+    console.print("; ".join([*told, "settled: median time (s)"]) + "\n", highlight=False)
     for team in teams:
         console.print(f"{team['group']}: {groups.words(team)}", highlight=False, markup=False)
     for row in rows:
@@ -115,48 +124,70 @@ def show(result: dict[str, Any], found: Sequence[groups.Measured]) -> None:
         console.print(f"Only the first {groups.MOST_PAIRS} pairs are compared.", highlight=False)
 
 
-def cells(row: dict[str, Any], ruled: bool) -> list[str]:
-    """One line of the evaluation's table."""
-    number = lambda v, digits: "-" if v is None else f"{v:.{digits}f}"
-    share = lambda part: f"{100 * part['success_rate']:.1f}"
-    low, high = row["interval"]
-    return [
-        escape(row["name"]),
-        share(row),
-        f"{100 * low:.1f}-{100 * high:.1f}",
-        share(row["at_rest"]),
-        share(row["stayed"]) if row["beyond_steps"] else "-",
-        *[share(row["violations"])] * ruled,
-        share(row["radii"][0]),
-        number(row["final_distance"]["0.5"], 3),
-        number(row["final_distance"]["0.95"], 3),
-        number(row["final_speed"]["0.5"], 2),
-        number(row["final_spin"]["0.5"], 2),
-        number(row["settling_time"]["0.5"], 1),
+class Column(NamedTuple):
+    """A column of the evaluation's table: its head, and what it says of a row; "" if nothing."""
+
+    head: str
+    says: Callable[[dict[str, Any]], str]
+
+
+def share(part: dict[str, Any] | None) -> str:
+    return "" if part is None else f"{100 * part['success_rate']:.1f}"
+
+
+def number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}" if value < 100 else f"{value:.0f}"
+
+
+def columns(first: dict[str, Any], ruled: bool, fails: bool) -> list[Column]:
+    """The columns of the evaluation's table, the first for a name."""
+    half = f"{first['radii'][0]['radius']:.2g}".removeprefix("0")
+    median = lambda name: lambda row: f"{row[name]['0.5']:.2f}" if name in row else ""
+    interval = lambda row: "-".join(f"{100 * x:.1f}" for x in row["interval"])
+    every = [
+        Column("run", lambda row: escape(row["name"])),
+        Column("success", share),
+        Column(f"{100 * first['confidence']:g} %", interval),
+        Column("failed", lambda row: share(row["failed"]) if fails else ""),
+        Column("rest", lambda row: share(row.get("at_rest"))),
+        Column("stays", lambda row: share(row["stayed"]) if row["beyond_steps"] else "-"),
+        Column("broken", lambda row: share(row["violations"]) if ruled else ""),
+        Column(f"in {half}", lambda row: share(row["radii"][0])),
+        Column("median", lambda row: number(row["final_distance"]["0.5"])),
+        Column("95 %", lambda row: number(row["final_distance"]["0.95"])),
+        Column("cost", lambda row: number(row["cost_mean"])),
+        Column("m/s", median("final_speed")),
+        Column("rad/s", median("final_spin")),
+        Column("settled", lambda row: number(row["settling_time"]["0.5"])),
     ]
+    return every
 
 
-def _table(
-    title: str, result: dict[str, Any], found: Sequence[groups.Measured], ruled: bool
-) -> Table:
-    """A row for each run and, where there are several, one for their group."""
+def _spoken_of(rows: Sequence[dict[str, Any]], found: Sequence[groups.Measured]) -> list[bool]:
+    """Whether violations and failures get a column: a game speaks of them, or one occurred."""
+    says = {name for m in found for name in rules(m.game)}
+    occurred = lambda name: any(r[name]["successes"] for r in rows)
+    return [name in says or occurred(name) for name in ("violations", "failed")]
+
+
+def _table(result: dict[str, Any], found: Sequence[groups.Measured]) -> tuple[list[str], Table]:
+    """Its heads, and a row for each run and, where there are several, one for their group."""
     rows, teams = result["runs"], result["groups"]
+    ruled, fails = _spoken_of(rows, found)
     table = Table(
-        title=title,
         title_justify="left",
         box=box.SIMPLE_HEAD,
         pad_edge=False,
         padding=0,  # the box has a blank between columns; names need the room on 80 of them
     )
-    table.add_column("run", overflow="fold", min_width=10)
-    percent = f"{100 * rows[0]['confidence']:g} %"
-    heads = ["success", percent, "rest", "stays", *["broken"] * ruled, "in .05"]
-    for head in [*heads, "median", "95 %", "m/s", "rad/s", "settled"]:
-        table.add_column(head, justify="right", no_wrap=True)
-    by_name = {row["name"]: row for row in rows}
+    by_name, lines = {row["name"]: row for row in rows}, []
     for members, team in zip(groups.grouped(found).values(), teams, strict=True):
-        for row in [by_name[m.name] for m in members]:
-            table.add_row(*cells(row, ruled))
-        if len(members) > 1:
-            table.add_row(*cells(team | {"name": team["about"]}, ruled))
-    return table
+        lines += [by_name[m.name] for m in members]
+        lines += [team | {"name": team["about"]}] * (len(members) > 1)
+    name, *others = [c for c in columns(rows[0], ruled, fails) if any(map(c.says, lines))]
+    table.add_column(name.head, overflow="fold", min_width=10)
+    for column in others:
+        table.add_column(column.head, justify="right", no_wrap=True)
+    for line in lines:
+        table.add_row(name.says(line), *(column.says(line) or "-" for column in others))
+    return [column.head for column in others], table

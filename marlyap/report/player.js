@@ -10,7 +10,7 @@
   const stillness = matchMedia("(prefers-reduced-motion: reduce)"), darkness = matchMedia("(prefers-color-scheme: dark)");
   const TRAIL = 1.5; // seconds
 
-  let film = films[0], frame = 0, playing = false, before = 0, request = 0, colours = {};
+  let film = films[0], frame = 0, playing = false, before = 0, request = 0, pace = 1, colours = {};
 
   // ---- small tools ----
 
@@ -233,9 +233,18 @@
     }));
   }
 
+  function fitPace() { // in real time unless that would be over in a blink or take minutes
+    const lasts = last() * film.dt;
+    pace = lasts > 1 && lasts < 60 || !lasts ? 1 : 10 ** Math.round(Math.log10(lasts / 8));
+    for (const option of speed.options) {
+      option.dataset.name ??= option.textContent;
+      option.textContent = pace === 1 ? option.dataset.name : Number((option.value * pace).toPrecision(3)) + " × real time";
+    }
+  }
+
   function tick(now) {
     if (!playing) return;
-    const passed = Math.max(0, now - before) / 1000 * Number(speed.value) / film.dt;
+    const passed = Math.max(0, now - before) / 1000 * Number(speed.value) * pace / film.dt;
     if (!stillness.matches || passed >= 1) { // with reduced motion: from step to step, nothing in between
       const next = frame + passed;
       frame = Math.min(stillness.matches ? Math.floor(next) : next, last());
@@ -266,6 +275,7 @@
     film = films[(index + films.length) % films.length];
     buttons.forEach((button, k) => button.setAttribute("aria-pressed", String(films[k] === film)));
     scrubber.max = last();
+    fitPace();
     const falls = film.strips.find((row) => row.rises), map = film.panels.length > 0;
     find(".rises").hidden = !falls;
     find(".rises span").textContent = (falls ? falls.name : "") + " rises (by over 0.1 % of its largest)";
