@@ -55,12 +55,24 @@ def room_for_programs():
         gc.collect()
 
 
-@pytest.fixture(scope="module")
+def optimise(fully):
+    """Whether XLA optimises what this process and its children compile from now on."""
+    jax.config.update("jax_disable_most_optimizations", not fully)
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(not fully)
+
+
+@pytest.fixture(autouse=True, scope="session")
 def quick_compilation():
-    """Half the time to compile, twice the time to run: for modules that mostly compile."""
-    jax.config.update("jax_disable_most_optimizations", True)
+    """Half the time to compile, twice the time to run: most tests mostly compile."""
+    optimise(fully=False)
+
+
+@pytest.fixture(scope="module")
+def full_compilation(quick_compilation):
+    """As users compile: for modules that pin digits, or that run for longer than they compile."""
+    optimise(fully=True)
     yield
-    jax.config.update("jax_disable_most_optimizations", False)
+    optimise(fully=False)
 
 
 def put_anywhere(data, value, tree):

@@ -22,7 +22,6 @@ from marlyap.tasks import Rendezvous
 
 GAME = Rendezvous(agents=2, horizon=6, dynamics=Unicycle())
 KEY = jax.random.key(3)
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def test_the_gradient_is_that_of_finite_differences():

@@ -21,7 +21,6 @@ from marlyap.simulation.evaluation import evaluate
 from marlyap.tasks import TASKS, Rendezvous
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 KEY = jax.random.key(0)
 
 
@@ -126,6 +125,11 @@ TINY = """--task.horizon 6 --steps 24 --schedule.environments 2 --schedule.warmu
 --schedule.select_episodes 2 --schedule.steps_per_update 6""".split()
 
 
+def game_has_a_map(task):
+    game = TASKS[task]
+    return game.scene(game.reset(KEY)) is not None
+
+
 @pytest.mark.parametrize("task", BENCH)
 def test_every_command_takes_it(task, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -139,6 +143,8 @@ def test_every_command_takes_it(task, tmp_path, monkeypatch, capsys):
     made = said("train", task, "masac-lyapunov", "--out", "out", *TINY)
     assert made["runs"][0]["finished"]
     assert said("evaluate", run, "--episodes", "4")["runs"][0]["episodes"] == 4
+    assert main(["evaluate", run, "hold", "--task", task, *TINY[:2], "--episodes", "4"]) == 0
+    assert "cost" in (table := capsys.readouterr().out) and ("m/s" in table) == game_has_a_map(task)
     assert said("report", run) and Path(run, "report.html").stat().st_size > 10_000
     assert said("watch", run) and Path(run, "film.gif").read_bytes()[:3] == b"GIF"
     asked = ("--certificates", "reach", "quantiles", "--rollouts", "1000")

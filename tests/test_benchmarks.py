@@ -39,7 +39,6 @@ SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("agents", "peer"
 
 
 @pytest.mark.parametrize("name", ["checkpoint", "environment", "update", *SLOW])
-@pytest.mark.usefixtures("quick_compilation")
 def test_quick(name, benchmarks, tmp_path, capsys):
     benchmarks(name)["main"](["--quick", "--out", str(tmp_path)])
     written = json.loads((tmp_path / f"{name}-quick.json").read_text())

@@ -20,9 +20,6 @@ from marlyap.tasks import Formation, Rendezvous
 from marlyap.types import State
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
-
 class Sound(Rendezvous):
     """A task as small as they come, in which agents 0 and 2 do not see each other."""
 

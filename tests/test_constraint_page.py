@@ -16,7 +16,6 @@ from marlyap.nets.nets import Sample
 from marlyap.runs import config
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 PAGE = Path(__file__).parents[1] / "docs" / "add-a-constraint.md"
 CONSTRAINT, _, READING = blocks(PAGE)
 

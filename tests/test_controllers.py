@@ -24,7 +24,6 @@ from marlyap.tasks import CartPoles, Microgrid, Rendezvous
 from marlyap.types import State
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 LAWS = ["point-offset", "gradient-consensus", "lin-francis-maggiore", "tree-pursuit"]
 OTHERS = {"cart-lqr": CartPoles(), "cart-feedback": CartPoles(), "grid-feedback": Microgrid()}
 ANY = ("zero", "hold", "uniform")

@@ -8,7 +8,6 @@ import jax
 import pytest
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 SHORT = {r"steps=[\d_]+": "steps=640, environments=4, warmup=160, select_episodes=20"}

@@ -33,7 +33,6 @@ GAMES = VARIANTS | {f"TASKS[{k}]": g for k, g in TASKS.items() if g not in VARIA
 PLANAR = {k: g for k, g in GAMES.items() if isinstance(g, AbstractPlanar)}
 every_game = pytest.mark.parametrize("game", GAMES.values(), ids=GAMES)
 every_planar_game = pytest.mark.parametrize("game", PLANAR.values(), ids=PLANAR)
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 @eqx.filter_jit
@@ -120,7 +119,7 @@ def test_the_target_set_is_kept_by_the_action_that_holds_it(game):
         success, failed, close, zero = there(jax.random.key(seed))
         assert success and not failed and close
         for values in zero:
-            np.testing.assert_allclose(values, 0, atol=1e-9)
+            np.testing.assert_allclose(values, 0, atol=1e-6)
 
 
 @every_game

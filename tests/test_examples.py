@@ -8,7 +8,6 @@ import pytest
 from marlyap import MASAC, Schedule, evaluate, train
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 EXAMPLES = sorted(Path(__file__).parents[1].glob("examples/*.py"))
 # The README's block is shortened to the same, so that they share what is compiled.
 SMALL = dict(steps=640, environments=4, warmup=160, select_episodes=20)

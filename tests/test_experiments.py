@@ -22,7 +22,6 @@ SCRIPTS = {
     "ingredients": ["ingredient", "budget"],
     "sizes": ["algorithm", "agents", "graph", "leaders", "budget"],
 }
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 slow = pytest.mark.slow
 every_script = pytest.mark.parametrize(
     "name", ["headline", *(pytest.param(name, marks=slow) for name in list(SCRIPTS)[1:])]

@@ -7,7 +7,6 @@ import pytest
 
 
 FILE = Path(__file__).parents[1] / "reliability" / "liars.py"
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def load():

@@ -20,7 +20,6 @@ from marlyap.runs.run import Run
 from marlyap.tasks.rendezvous import Rendezvous
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 KEY = jax.random.key(3)
 TINY = dict(batch=8, actor_width=8, critic_width=8)
 

@@ -28,7 +28,6 @@ from marlyap.storage import store
 from marlyap.tasks import Rendezvous
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 GAME = Rendezvous(agents=2, horizon=4, dynamics=SingleIntegrator())
 SMALL = {"actor_width": 4, "critic_width": 4, "batch": 4}
 FEW = ("--episodes", "20")

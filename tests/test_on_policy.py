@@ -23,7 +23,6 @@ from marlyap.simulation.evaluation import outcomes
 from marlyap.simulation.rollout import Decentralised, Uniform
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 PAGE = Path(__file__).parents[1] / "docs" / "add-an-algorithm.md"
 KEY = jax.random.key(4)
 

@@ -27,7 +27,6 @@ from marlyap.simulation.rollout import Decentralised, cost_to_go, rollout
 from marlyap.tasks import TASKS
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 KEY = jax.random.key(5)
 
 

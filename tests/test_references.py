@@ -31,7 +31,6 @@ from marlyap.storage import store
 from marlyap.tasks.rendezvous import Rendezvous
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 KEY = jax.random.key(4)
 SMALL = dict(actor_width=4, critic_width=4, batch=16)
 ONE = jnp.ones(())

@@ -16,7 +16,6 @@ from collections import Counter, deque
 from pathlib import Path
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -167,7 +166,6 @@ QUICK = ("apg", "matd3")
 @pytest.mark.parametrize(
     "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in EACH]
 )
-@pytest.mark.usefixtures("quick_compilation")
 def test_each_algorithm_and_each_reading_resumes_bit_for_bit(
     name, uninterrupted, tmp_path, monkeypatch
 ):
@@ -691,15 +689,6 @@ class Child:
         if self.process.poll() is None:
             self.process.kill()
             self.process.wait()
-
-
-@pytest.fixture
-def full_compilation():
-    """As another process compiles, whatever a test before this one has asked for."""
-    before = jax.config.values["jax_disable_most_optimizations"]
-    jax.config.update("jax_disable_most_optimizations", False)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
 
 
 @pytest.mark.slow

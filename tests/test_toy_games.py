@@ -42,7 +42,6 @@ ALGORITHMS = {
     "maddpg": MADDPG(**QUICK),
     "matd3": MADDPG(**QUICK, critics=2, smoothing=0.2, delay=2),
 }
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 BANDIT, CONSTANT, REACH = range(3)
 
 

@@ -24,7 +24,6 @@ from marlyap.tasks import Rendezvous
 
 
 PURPOSES = ("train", "select", "evaluate", "calibrate", "certify", "perturb")
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 traces = Counter()
 
 

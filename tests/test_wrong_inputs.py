@@ -276,7 +276,7 @@ CASES = [
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory, quick_compilation):
+def place(tmp_path_factory):
     """A directory with a small run, its certificate, and all that can be wrong."""
     import os
 
