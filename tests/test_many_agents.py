@@ -10,6 +10,7 @@ import pytest
 from conftest import close, filled
 from test_paper import mlp, rows, xs
 
+from marlyap import train
 from marlyap.errors import UserError
 from marlyap.learning import optimiser
 from marlyap.learning.algorithms.masac import MASAC
@@ -32,6 +33,40 @@ def plainly(Q, features, action, xp=np):
     value = lambda k, i: mlp(Q.nets, xp.concatenate([x[i], others[i]]), (k,), xp)[0]
     each = xp.stack([xp.stack([value(k, i) for i in range(n)]) for k in (0, 1)])
     return each.mean(1, keepdims=True) if Q.team else each
+
+
+def test_agents_of_one_kind_share_weights(shape, batch):
+    kinds = shape._replace(kinds=(1, 0, 1))
+    shared, own = (filled(lambda k, s=s: Actors(kinds, 8, s, key=k), KEY) for s in (True, False))
+    assert shared.net.layers[0].weight.shape[0] == 2 and own.net.layers[0].weight.shape[0] == 3
+    alike = jnp.tile(batch.obs[0, :1], (3, 1))
+    action = jax.jit(lambda obs: shared.mode(obs))(alike)
+    np.testing.assert_allclose(action[0], action[2], rtol=1e-6)
+    assert np.all(np.abs(action[0] - action[1]) > 1e-3)
+    noise = 0.3 * jnp.ones((3, 2))
+    for i, kind in enumerate(kinds.kinds):
+        net = jax.tree.map(lambda leaf, k=kind: leaf[k][None], shared.net)
+        alone = eqx.tree_at(lambda a: (a.net, a.shared), shared, (net, False))
+        ours = eqx.filter_jit(shared.sample)(alike, noise, noise)
+        theirs = eqx.filter_jit(alone.sample)(alike[:1], noise[:1], noise[:1])
+        for a, b in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(a[i], b[0], rtol=1e-5, atol=1e-6)
+
+
+class Mixed(Rendezvous):
+    """A leader of another kind than its followers."""
+
+    @property
+    def kinds(self):
+        return np.where(self.leads, 1, 0)
+
+
+def test_a_policy_of_several_kinds_trains():
+    algorithm = MASAC(**TINY, shared=True)
+    plan = Schedule(steps=24, environments=2, steps_per_update=3, warmup=6, select_episodes=2)
+    trained = train(Mixed(horizon=3), algorithm, plan, progress=False)
+    assert trained.policy.pi.shared == (1, 0, 0)
+    assert trained.policy.pi.net.layers[0].weight.shape[0] == 2
 
 
 @pytest.mark.parametrize("team", [False, True])

@@ -31,6 +31,7 @@ from marlyap.certificates.robustness import Robustness
 from marlyap.certificates.safety import Apart, Safe
 from marlyap.certificates.theorem1 import Theorem1
 from marlyap.cli import main
+from marlyap.controllers import CartFeedback
 from marlyap.errors import UserError
 from marlyap.games.dynamics import DoubleIntegrator, LateUnicycle, SingleIntegrator, Unicycle
 from marlyap.games.perturbed import Perturbed, traced
@@ -38,12 +39,12 @@ from marlyap.nets.nets import Actors, Greedy, NormNet, Shape
 from marlyap.recheck import Rejected, reader, recheck
 from marlyap.recheck.bounds import lower, needed, order
 from marlyap.recheck.checks import swept
-from marlyap.recheck.world import World, adjacency, hops, places
+from marlyap.recheck.world import World, adjacency, hops, places, unknown
 from marlyap.simulation.rollout import Decentralised, rollout
 from marlyap.statistics import lower_bound, quantile_upper_bound, trials_needed
 from marlyap.storage import store
 from marlyap.storage.hashing import as_json, named_arrays, policy_hash, without_arrays, words
-from marlyap.tasks.rendezvous import Rendezvous
+from marlyap.tasks import CartPoles, Rendezvous
 from marlyap.threefry import fold, normal, uniform, uniform64
 
 
@@ -774,24 +775,60 @@ OwnGreedy = type("Greedy", (Greedy,), {"__module__": "my_policy"})
 
 def test_it_names_what_it_does_not_know():
     def of_game(game, policy=Greedy):
-        return of(game, Decentralised(policy(driver(GAME).policy.pi), game))
+        controller = without_arrays(Decentralised(policy(driver(GAME).policy.pi), game))
+        return unknown(*json.loads(json.dumps([as_json(game), as_json(controller)])))
 
-    of_game(GAME)
+    assert of_game(GAME) is None
     ring = {f: getattr(GAME, f) for f in ("agents", "leaders", "horizon", "dynamics")}
-    for game, unknown in (
+    for game, what in (
         (MovingRing(**ring), "the game MovingRing (own code)"),
         (OwnRendezvous(**ring), "the game Rendezvous (own code)"),
         (Perturbed(inner=GAME, noise=0.1), "the game Perturbed"),
         (Rendezvous(**ring, graph="disk:1.5"), "the graph disk:1.5"),
         (Rendezvous(agents=2, dynamics=SingleIntegrator(integrator="rk4")), "the integrator rk4"),
     ):
-        with pytest.raises(UserError) as caught:
-            of_game(game)
-        text = str(caught.value)
-        assert text.startswith(f"recheck: {unknown} is unknown to it; recheck knows rendezvous on")
-        assert "(" not in text.replace("(own code)", "")
-    with pytest.raises(UserError, match="the policy Greedy \\(own code\\) is unknown"):
-        of_game(GAME, OwnGreedy)
+        assert of_game(game) == what
+    assert of_game(GAME, OwnGreedy) == "the policy Greedy (own code)"
+
+
+@pytest.fixture(scope="module")
+def without_a_model(tmp_path_factory):
+    """A certificate about a game that recheck has no model of."""
+    game, path = CartPoles(agents=2, horizon=20), tmp_path_factory.mktemp("other") / "c"
+    table = {"reach": Reach(rollouts=500, share=0.9), "quantiles": Quantiles(rollouts=500, q=0.9)}
+    result = certify(game, CartFeedback(game), table, seed=1, confidence=0.99)
+    save(path, result, game, CartFeedback(game))
+    return path
+
+
+def test_of_a_game_without_a_model_it_checks_what_follows_from_the_counts(without_a_model, capsys):
+    found = recheck(without_a_model)
+    assert not found["agrees"] and found["holds"] is None and found["rechecked"] == {}
+    assert "no model of the game CartPoles; its bound is" in found["not_rechecked"]["reach"]
+    assert main(["recheck", str(without_a_model)]) == 1
+    said = capsys.readouterr().out
+    assert said.count("NOT CHECKED") == 2 and "0 of 2 verdicts were derived again" in said
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        ("verdicts/reach/successes", lambda k: k + 3),
+        ("verdicts/reach/bound", 0.97),
+        ("verdicts/reach/trials", 501),
+        ("verdicts/reach/confidence", 0.9999),
+        ("verdicts/quantiles/holds", lambda held: not held),
+        ("verdicts/reach/holds", lambda held: not held),
+        ("certificates/reach/share", 2.0),
+        ("policy", "0" * 64),
+    ],
+    ids=lambda edit: edit[0],
+)
+def test_of_a_game_without_a_model_it_rejects_what_contradicts_itself(
+    without_a_model, tmp_path, edit
+):
+    with pytest.raises(Rejected):
+        recheck(altered(without_a_model, tmp_path / "c", put(edit)))
 
 
 def test_own_code_is_marked():
@@ -867,7 +904,7 @@ def test_it_is_short_enough_to_be_read():
     """What has to be judged by eye: no file of it is longer than 600 lines."""
     folder = Path(marlyap.recheck.__file__).parent
     lengths = {file.name: len(file.read_text().splitlines()) for file in folder.glob("*.py")}
-    assert sum(lengths.values()) < 1700 and max(lengths.values()) < 600, lengths
+    assert sum(lengths.values()) < 1750 and max(lengths.values()) < 600, lengths
 
 
 def test_the_worst_case_is_the_one_that_failed_worst():

@@ -57,7 +57,7 @@ class Contraction(AbstractCertificate):
     rollouts: int = 10_000  # of the test
     calibration: int = 10_000  # rollouts that choose beta
     T: int = 20  # steps
-    c_min: float | None = None  # a cost; None: the game's edge of success
+    c_min: float | None = None  # a cost; None: that at the edge of success
     least: float = 0.01  # a smaller beta is no contraction: in H steps it cannot be told from 0
     share: float = 0.98
     confidence: float = 0.999
@@ -100,7 +100,7 @@ class Contraction(AbstractCertificate):
             )
 
     def floor(self, game) -> float:
-        return game.edge if self.c_min is None else self.c_min
+        return game.edge_cost if self.c_min is None else self.c_min
 
     def judge(self, game, V, trajectory, key):
         c = jnp.mean(trajectory.cost, axis=1)

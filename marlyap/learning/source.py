@@ -119,4 +119,5 @@ def shape(game: AbstractGame) -> Shape:
     state = eqx.filter_eval_shape(game.reset, jax.random.key(0))
     see = lambda s: (game.observations(s), game.features(s), game.errors(s))
     obs, features, errors = eqx.filter_eval_shape(see, state)
-    return Shape(game.agents, obs.shape[1], features.shape[1], errors.shape[1], game.du)
+    kinds = tuple(int(k) for k in game.kinds)
+    return Shape(game.agents, obs.shape[1], features.shape[1], errors.shape[1], game.du, kinds)

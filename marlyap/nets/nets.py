@@ -20,6 +20,7 @@ class Shape(NamedTuple):
     features: int
     errors: int  # how many leading features are zero exactly on the target set
     du: int
+    kinds: tuple[int, ...] = ()  # of each agent: those of one kind may share weights; (): all alike
 
 
 EPS = 1e-5  # of LayerNorm
@@ -92,32 +93,42 @@ class Sample(NamedTuple):
 class Actors(eqx.Module):
     """pi_phi = {pi_phi_1, ..., pi_phi_N}: a Gaussian squashed by tanh for every agent.
 
-    Agent i's action is made of row i of the observations alone. Shared weights serve any number
-    of agents.
+    Agent i's action is made of row i of the observations alone. Weights are each agent's own, or
+    shared by all, which serves any number of agents, or shared by those of one kind.
     """
 
-    net: MLP  # leaves have a leading axis `agent`, unless shared
-    shared: bool
+    net: MLP  # leaves have a leading axis `agent`, or `kind`; none where all share
+    shared: bool | tuple[int, ...]  # the kind of each agent where those of one kind share
     du: int
 
     def __init__(self, shape: Shape, width: int, shared: bool = False, *, key: Key):
         make = lambda k: MLP((shape.obs, width, width, 2 * shape.du), key=k)
-        several = lambda: eqx.filter_vmap(make)(jax.random.split(key, shape.agents))
-        self.net = make(key) if shared else several()
-        self.shared = shared
+        several = lambda n: eqx.filter_vmap(make)(jax.random.split(key, n))
+        self.shared = shape.kinds if shared and len({*shape.kinds}) > 1 else shared
+        if isinstance(self.shared, tuple):
+            self.net = several(1 + max(self.shared))
+        else:
+            self.net = make(key) if shared else several(shape.agents)
         self.du = shape.du
+
+    @property
+    def each(self) -> MLP:
+        """The weights of each agent; one set where all share it."""
+        if isinstance(self.shared, bool):
+            return self.net
+        return jax.tree.map(lambda leaf: leaf[jnp.array(self.shared)], self.net)
 
     def sample(self, obs: Obs, noise: Action, memory: Action) -> Sample:
         """tanh(mean + std * noise) for standard normal noise: reparametrised."""
-        per_agent = _squashed_rows if self.shared else eqx.filter_vmap(_squashed)
+        per_agent = _squashed_rows if self.shared is True else eqx.filter_vmap(_squashed)
         column = lambda x: x[..., None]
-        out = per_agent(self.net, (column(obs), column(noise), column(memory)))
+        out = per_agent(self.each, (column(obs), column(noise), column(memory)))
         return Sample(out[0][..., 0], out[1][..., 0, 0], out[2][..., 0, 0])
 
     def mode(self, obs: Obs) -> Action:
         """The deterministic policy that is evaluated, certified and deployed."""
-        per_agent = _apply_to_rows if self.shared else eqx.filter_vmap(_apply)
-        return jnp.tanh(jnp.split(per_agent(self.net, obs[..., None])[..., 0], 2, axis=-1)[0])
+        per_agent = _apply_to_rows if self.shared is True else eqx.filter_vmap(_apply)
+        return jnp.tanh(jnp.split(per_agent(self.each, obs[..., None])[..., 0], 2, axis=-1)[0])
 
 
 def _squash(net: MLP, x: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:

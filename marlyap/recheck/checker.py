@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 
 from marlyap.recheck import checks
+from marlyap.recheck.bounds import lower
 from marlyap.recheck.checks import Case, near
 from marlyap.recheck.linear import linearisation
 from marlyap.recheck.reader import Arrays, Rejected, agree, policy_hash, read, record
 from marlyap.recheck.sentences import Sentences
-from marlyap.recheck.world import FLAG, LIST, NUMBER, OBJECT, TEXT, WHOLE, World
+from marlyap.recheck.world import FLAG, LIST, NUMBER, OBJECT, TEXT, WHOLE, World, unknown
 
 
 MALFORMED = (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError)
@@ -46,6 +47,7 @@ ASKED = {
     | dict(calibration=WHOLE, T=WHOLE, stay=WHOLE, weights=LIST, slack=NUMBER)
     | dict(within=(*NUMBER, NONE)),
     "Theorem1": SAMPLED | dict(old=(dict, NONE), noise=NUMBER, rate=NUMBER, lipschitz=TEXT),
+    "Safe": SAMPLED | dict(stay=WHOLE),
     "Apart": SAMPLED | dict(calibration=WHOLE, stay=WHOLE, least=NUMBER),
     "Linearisation": dict(scenes=WHOLE, margin=NUMBER, decay=NUMBER),
     "Proof": dict(c=NUMBER, rho=NUMBER, inner=NUMBER, half=LIST, eta=NUMBER, decay=NUMBER)
@@ -67,7 +69,8 @@ CHECKS: dict[str, Callable[[Case], dict[str, Any]]] = {
     "Composition": checks.composition,
     "Theorem1": checks.theorem1,
 }
-STATISTICAL = {*CHECKS}  # those that share the confidence
+STATISTICAL = {*CHECKS, "Safe"}  # those that share the confidence
+SHARES = STATISTICAL - {"Quantiles", "Robustness"}  # whose bound follows from one pair of counts
 CHECKS["Linearisation"] = linearisation
 ASKS_V = ("Decrease", "Basin", "Quantiles", "Theorem1")
 
@@ -82,7 +85,8 @@ def recheck(
     `not_rechecked` (names, with the reason). `tell` hears of each verdict as soon as it agrees.
 
     Raises Rejected (a UserError) at the first thing that differs and for a file that is damaged or
-    no certificate, and UserError for one about a game or a controller that it does not know.
+    no certificate. Of a game or a controller that it does not know it derives nothing anew, and
+    checks what follows from the counts.
     """
     try:
         return derive(*read(Path(path)), tell)
@@ -111,10 +115,20 @@ def derive(
             raise Rejected(f"certificate: {name} {what}.")
     if not verdicts:
         raise Rejected("certificate: it has no verdict, so there is nothing to check.")
-    sim = World(meta, arrays)
     shared = max(1, sum(kind in STATISTICAL for kind in kinds.values()))
     tail = (1 - meta["confidence"]) / (shared * meta["checkpoints"])
     near("the confidence of each certificate", 1 - tail, meta["confidence_each"], 1e-12)
+    for name, v in verdicts.items():
+        about(name, v, asked[name], kinds[name], tail)
+    whole = all(v["holds"] for v in verdicts.values())
+    if not (whole and meta["left_out"]):  # what is left out may have been optional, or not
+        agree("whether all hold", whole, meta["holds"])
+    if what := unknown(meta["game"], meta["controller"]):
+        left = {
+            name: counted(v, asked[name], kinds[name], tail, what) for name, v in verdicts.items()
+        }
+        return {"agrees": False, "holds": None, "rechecked": {}, "not_rechecked": left}
+    sim = World(meta, arrays)
     say, done, left = Sentences(meta["game"], meta["V"]), {}, {}
     agree("what the agents act on", say.information, meta["information"])
     if any(kind in ASKS_V for kind in kinds.values()):
@@ -126,13 +140,6 @@ def derive(
         left |= left_out(sim, say, name, why, asked)
     for name, v in verdicts.items():
         c, kind = asked[name], kinds[name]
-        record(f"the verdict of {name}", v, VERDICT)
-        agree("the name of a verdict", name, v["name"])
-        near(f"the confidence asked of {name}", 1 - tail, c["confidence"], 1e-12)
-        if kind in STATISTICAL:
-            near(f"the confidence of {name}", 1 - tail, v["confidence"], 1e-12)
-        else:
-            agree(f"the confidence of {name}", None, v["confidence"])
         if kind not in CHECKS:
             left[name] = unchecked(sim, kind)
             continue
@@ -142,11 +149,34 @@ def derive(
             continue
         done[name] = found
         tell(name, v)
-    whole = all(v["holds"] for v in verdicts.values())
-    if not (whole and meta["left_out"]):  # what is left out may have been optional, or not
-        agree("whether all hold", whole, meta["holds"])
     holds = None if left else meta["holds"]
     return {"agrees": not left, "holds": holds, "rechecked": done, "not_rechecked": left}
+
+
+def about(name: str, v: dict[str, Any], c: dict[str, Any], kind: str, tail: float) -> None:
+    """Check what every verdict says of itself, whatever the game: its parts and its confidence."""
+    record(f"the verdict of {name}", v, VERDICT)
+    agree("the name of a verdict", name, v["name"])
+    near(f"the confidence asked of {name}", 1 - tail, c["confidence"], 1e-12)
+    if kind in STATISTICAL:
+        near(f"the confidence of {name}", 1 - tail, v["confidence"], 1e-12)
+    else:
+        agree(f"the confidence of {name}", None, v["confidence"])
+
+
+def counted(v: dict[str, Any], c: dict[str, Any], kind: str, tail: float, what: str) -> str:
+    """Check what follows from the counts of a verdict alone; returns why no more can be checked."""
+    why = f"no rollout was played again, since recheck has no model of {what}"
+    if kind not in SHARES:
+        return why
+    k, n, name = v["successes"], v["trials"], v["name"]
+    if k is None or n is None or not 0 <= k <= n <= c["rollouts"]:
+        raise Rejected(f"certificate: {name} counts {k} successes in {n} trials, which cannot be.")
+    if v["bound"] is not None:
+        near(f"the bound of {name}", lower(k, n, tail), v["bound"], 1e-9)
+    if v["holds"] and not (v["bound"] is not None and v["bound"] >= c["share"]):
+        raise Rejected(f"certificate: {name} holds, but its bound is not the share that was asked.")
+    return f"{why}; its bound is that of its counts"
 
 
 def kind_of(name: str, asked: Any) -> str:
@@ -179,7 +209,7 @@ def left_out(
     sim: World, say: Sentences, name: str, why: Any, asked: dict[str, Any]
 ) -> dict[str, str]:
     """Check why a certificate was left out; returns it with a reason where that cannot be done."""
-    kind = {usual(kind): kind for kind in (*ASKED, "Safe", "ClosedForm")}.get(name)
+    kind = {usual(kind): kind for kind in (*ASKED, "ClosedForm")}.get(name)
     if kind is None or name in asked:
         raise Rejected(f"certificate: {name!r} cannot have been left out.")
     V = re.compile(re.escape(say.not_zero("@", "@")).replace("@", "([0-9.e+-]{1,12})"))
@@ -210,6 +240,8 @@ def usual(kind: str) -> str:
 
 def unchecked(sim: World, kind: str) -> str:
     """Why a verdict of a kind that is known cannot be derived here."""
+    if kind == "Safe":
+        raise Rejected("certificate: safe is about rules, and a rendezvous has none.")
     if sim.game["agents"] != 1:
         raise Rejected("certificate: a proof is about one agent, and the game has more.")
     return "a proof over boxes is not repeated here; repeat it with experiments/proof.py"

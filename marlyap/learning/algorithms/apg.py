@@ -48,7 +48,7 @@ class APG(AbstractAlgorithm):
 
     rate_pi: float = 2e-3  # learning rate
     actor_width: int = 64  # units in each of two hidden layers
-    shared: bool = False  # one set of actor weights for all agents
+    shared: bool = False  # one set of actor weights for all agents of a kind
     sharpness: float = 0.5  # extra cost of being beyond the edge of success, beside the cost
     clip: float = 1.0  # largest norm of a gradient
     ema_rate: float = 1e-2  # how fast the deployed policy follows the actor; 1 is the actor itself

@@ -56,7 +56,7 @@ class MADDPG(AbstractOffPolicy):
     critic_width: int = 64  # units in each of two hidden layers
     normalise: bool = True  # LayerNorm in the critics
     heads: Literal["team", "agent"] = "agent"  # a value for the team, or one for each agent's cost
-    shared: bool = False  # one set of actor weights for all agents
+    shared: bool = False  # one set of actor weights for all agents of a kind
     ema_rate: float = 1e-3  # how fast the deployed policy follows the actor; 1 is the actor itself
     critics: int = 1  # with 2 the smaller value is the target
     smoothing: float = 0.0  # standard deviation of the noise on the target's actions

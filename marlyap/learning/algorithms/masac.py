@@ -66,7 +66,7 @@ class MASAC(AbstractOffPolicy):
     critic_width: int = 64  # units in each of two hidden layers
     normalise: bool = True  # LayerNorm in the critics
     heads: Literal["team", "agent"] = "agent"  # a value for the team, or one for each agent's cost
-    shared: bool = False  # one set of actor weights for all agents
+    shared: bool = False  # one set of actor weights for all agents of a kind
     critic: Literal["joint", "mean-field"] = "joint"  # of everyone, or of one and the others' mean
     ema_rate: float = 1e-3  # how fast the deployed policy follows the actor; 1 is the actor itself
     use_Q: bool = True  # false drops Q from the policy objective (Han et al. 2020)
