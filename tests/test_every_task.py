@@ -31,7 +31,11 @@ VARIANTS = {
 }
 GAMES = VARIANTS | {f"TASKS[{k}]": g for k, g in TASKS.items() if g not in VARIANTS.values()}
 PLANAR = {k: g for k, g in GAMES.items() if isinstance(g, AbstractPlanar)}
-every_game = pytest.mark.parametrize("game", GAMES.values(), ids=GAMES)
+SLOW = {"TASKS[platoon-long]", "TASKS[ring]", "TASKS[ring2]"}  # many steps in an episode
+slowly = lambda name: [pytest.mark.slow] if name in SLOW else []
+every_game = pytest.mark.parametrize(
+    "game", [pytest.param(game, id=name, marks=slowly(name)) for name, game in GAMES.items()]
+)
 every_planar_game = pytest.mark.parametrize("game", PLANAR.values(), ids=PLANAR)
 
 

@@ -6,6 +6,7 @@ and actions beyond the limits, which have to clip.
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from marlyap.tasks import TASKS
 from marlyap.tasks.cartpoles import Row
 from marlyap.tasks.microgrid import Loads
 from marlyap.tasks.platoon import Road
+from marlyap.tasks.ring import Traffic
 from marlyap.types import State
 
 
@@ -69,6 +71,22 @@ def quads(task):
     return parts
 
 
+def ring(task):
+    def parts(start):
+        game, length = replace(TASKS[task], noise=0.0), start["L"]
+        order, n = game.plant.order(game.agents), game.plant.cars
+        # Laps are counted here, and not in the file: every car is behind the first.
+        line = start["x"][0] - jnp.cumsum(
+            jnp.mod(-jnp.diff(start["x"], prepend=start["x"][:1]), length)
+        )
+        flow = game.plant.flow(length / n - game.plant.size)
+        seed = jax.random.key_data(jax.random.key(0))
+        x = jnp.stack([line, start["v"]], axis=-1)[order]
+        return x, Traffic(length=length, flow=flow, noise=0 * length, seed=seed)
+
+    return parts
+
+
 CASES = {
     "rendezvous-unicycle": Case("rendezvous", planar),
     "formation-unicycle": Case("formation", planar),
@@ -81,6 +99,8 @@ CASES = {
         "quads-planar", quads("quads-planar"), lambda e: e[:, np.array([0, 1, 4, 2, 3, 5])]
     ),
     "quads-space": Case("quads-space", quads("quads-space")),
+    "ring": Case("ring", ring("ring"), lambda e: e.reshape(-1, 2)),
+    "ring2": Case("ring2", ring("ring2"), lambda e: e.reshape(-1, 2)),
 }
 
 

@@ -29,6 +29,11 @@ from marlyap.controllers.reference import (
     UniformlyRandom as UniformlyRandom,
     Zero as Zero,
 )
+from marlyap.controllers.ring_feedback import (
+    FollowerStopper as FollowerStopper,
+    RingHuman as RingHuman,
+    RingLinear as RingLinear,
+)
 
 
 CONTROLLERS: dict[str, type[AbstractController]] = {
@@ -46,6 +51,9 @@ CONTROLLERS: dict[str, type[AbstractController]] = {
     "platoon-linear": PlatoonLinear,
     "quad-chain": QuadChain,
     "quad-chain-space": QuadChainSpace,
+    "follower-stopper": FollowerStopper,
+    "ring-linear": RingLinear,
+    "ring-human": RingHuman,
     "zero": Zero,
     "hold": Hold,
     "uniform": UniformlyRandom,

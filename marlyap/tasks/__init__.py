@@ -11,6 +11,7 @@ from marlyap.tasks.quads import (
     SpaceFormation as SpaceFormation,
 )
 from marlyap.tasks.rendezvous import Rendezvous as Rendezvous
+from marlyap.tasks.ring import Ring as Ring
 
 
 TASKS = {
@@ -28,4 +29,6 @@ TASKS = {
     "platoon-long": Platoon(16, start_headway=(1.0, 1.0), start_speed=(1.5, 2.5)),
     "quads-planar": PlanarFormation(),
     "quads-space": SpaceFormation(),
+    "ring": Ring(),
+    "ring2": Ring(agents=2),
 }
