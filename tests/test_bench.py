@@ -74,12 +74,12 @@ MEASURED = [
 BENCH = tuple(dict.fromkeys(m.task for m in MEASURED))
 LOCAL = sorted({(m.task, m.controller) for m in MEASURED if m.controller != "uniform"})
 LONG = ("platoon-long", "ring", "ring2")  # many steps in an episode
-SLOW = (*LONG, "formation-di", "platoon-catchup", "quads-space")  # or like another one
+SLOW = (*LONG, "platoon-catchup", "quads-planar", "quads-space")  # or much like another
 
 
 def marked(cases, task, slow=LONG):
     """Those of tasks that take long are slow."""
-    name = lambda case: "-".join(str(part) for part in (case if type(case) is tuple else case[:2]))
+    name = lambda case: case if isinstance(case, str) else "-".join(case[:2])
     slowly = lambda case: [pytest.mark.slow] if task(case) in slow else []
     return [pytest.param(case, marks=slowly(case), id=name(case)) for case in cases]
 
