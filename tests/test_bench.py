@@ -17,6 +17,7 @@ from marlyap.cli import main
 from marlyap.controllers import CONTROLLERS
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractRegulation
+from marlyap.runs import bench
 from marlyap.simulation.evaluation import evaluate
 from marlyap.tasks import TASKS, Rendezvous
 
@@ -45,6 +46,21 @@ MEASURED = [
     Measured("microgrid", "grid-feedback", 0.00555, 0.08, 1.0),
 ]
 BENCH = tuple(dict.fromkeys(m.task for m in MEASURED))
+
+
+class Counted:
+    """A function that counts its calls, and is interrupted in one of them."""
+
+    def __init__(self, f, stop=None):
+        self.f, self.stop, self.calls = f, stop, 0
+
+    def __call__(self, *args, **options):
+        self.calls += 1
+        if self.calls == self.stop:
+            raise KeyboardInterrupt
+        return self.f(*args, **options)
+
+
 LOCAL = sorted({(m.task, m.controller) for m in MEASURED if m.controller != "uniform"})
 
 
@@ -130,7 +146,12 @@ def game_has_a_map(task):
     return game.scene(game.reset(KEY)) is not None
 
 
-@pytest.mark.parametrize("task", BENCH)
+FAST = ("microgrid",)  # without a map, and with a holding action
+
+
+@pytest.mark.parametrize(
+    "task", [t if t in FAST else pytest.param(t, marks=pytest.mark.slow) for t in BENCH]
+)
 def test_every_command_takes_it(task, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     run = "out/seed0"
@@ -166,3 +187,50 @@ def test_a_controller_of_another_game_is_refused(task, controller):
             elsewhere.__check_init__()
     else:
         elsewhere.__check_init__()
+
+
+def test_the_bench_measures_each_cell_once(tmp_path, monkeypatch, capsys):
+    """Two games and a run of one; stopped in the middle and resumed; then nothing is left."""
+    monkeypatch.chdir(tmp_path)
+    small = "--steps 2000 --schedule.environments 2 --schedule.warmup 1000".split()
+    small += "--schedule.select_episodes 2 --schedule.steps_per_update 500".split()
+    assert main(["train", "cartpoles", "masac", "--out", "r", *small]) == 0
+    monkeypatch.setattr(bench, "evaluate", counted := Counted(evaluate, stop=5))
+    asked = ["bench", "cartpoles", "microgrid", "--quick", "--out", "b", "--runs", "r", "--json"]
+    assert main(asked) == 130
+    assert not Path("b/bench.csv").exists() and len(list(Path("b/cells").rglob("*.json"))) == 4
+    counted.stop = None
+    capsys.readouterr()
+    rows = json.loads((main(asked), capsys.readouterr().out)[1])["rows"]
+    assert counted.calls == 1 + len(rows) and len({r["controller"] for r in rows}) == 7
+    page = Path("b/bench.html").read_text()
+    assert "cart-feedback" in page and "r/seed0" in page and "http" not in page
+    assert Path("b/bench.csv").read_text().count("\n") == 1 + len(rows)
+    by = {(r["game"], r["controller"], r["horizons"]): r for r in rows}
+    assert by["microgrid", "grid-feedback", 2]["success"] == 1.0
+    assert by["cartpoles", "zero", 1]["failed"] == 1.0
+    assert by["cartpoles", "zero", 2]["steps"] == 1000
+    main(asked)
+    assert counted.calls == 1 + len(rows)
+    Path("b/cells/cartpoles/zero-1.json").write_text("{}")
+    main(asked)
+    assert counted.calls == 2 + len(rows)
+
+
+@pytest.mark.parametrize(
+    ("argv", "says"),
+    [
+        (["cartpole"], "did you mean 'cartpoles'"),
+        (["cartpoles", "--controllers", "cart-lrq"], "did you mean 'cart-lqr'"),
+        (["cartpoles", "--controllers", "grid-feedback"], "drives none of these games"),
+        (["cartpoles", "--episodes", "0"], "episodes: 0 is out of range"),
+        (["cartpoles", "--longer", "0"], "longer: 0 is out of range"),
+        (["cartpoles", "--task.agents", "4"], "the bench measures the games as they are"),
+        (["cartpoles", "--runs", "nowhere"], "nowhere"),
+    ],
+)
+def test_what_the_bench_cannot_do_is_one_sentence(argv, says, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["bench", *argv]) == 2
+    said = capsys.readouterr().err
+    assert says in said and said.count("\n") == 1
