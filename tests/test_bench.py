@@ -204,7 +204,7 @@ def test_the_bench_measures_each_cell_once(tmp_path, monkeypatch, capsys):
     rows = json.loads((main(asked), capsys.readouterr().out)[1])["rows"]
     assert counted.calls == 1 + len(rows) and len({r["controller"] for r in rows}) == 7
     page = Path("b/bench.html").read_text()
-    assert "cart-feedback" in page and "r/seed0" in page and "http" not in page
+    assert "cart-feedback" in page and "r/seed0" in page and "://" not in page
     assert Path("b/bench.csv").read_text().count("\n") == 1 + len(rows)
     by = {(r["game"], r["controller"], r["horizons"]): r for r in rows}
     assert by["microgrid", "grid-feedback", 2]["success"] == 1.0
