@@ -168,6 +168,9 @@ def test_every_command_takes_it(task, tmp_path, monkeypatch, capsys):
     assert "cost" in (table := capsys.readouterr().out) and ("m/s" in table) == game_has_a_map(task)
     assert said("report", run) and Path(run, "report.html").stat().st_size > 10_000
     assert said("watch", run) and Path(run, "film.gif").read_bytes()[:3] == b"GIF"
+    assert (
+        main(["watch", "hold", "--task", task, "--episode", "2"]) == 0 and Path("film.gif").exists()
+    )
     asked = ("--certificates", "reach", "quantiles", "--rollouts", "1000")
     verdicts = said("certify", run, *asked, ends=(0, 1))
     assert verdicts
