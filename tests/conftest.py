@@ -67,6 +67,7 @@ def optimise(fully):
     """Whether XLA optimises what this process and its children compile from now on."""
     jax.config.update("jax_disable_most_optimizations", not fully)
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(not fully)
+    jax.clear_caches()  # or what is compiled already would be used as it is
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -37,11 +37,22 @@ def test_code_blocks_run(page, tmp_path, monkeypatch):
             exec(compile(block, f"{page.name}[{k}]", "exec"), names)
 
 
-def test_the_reference_is_what_the_docstrings_say():
-    spec = importlib.util.spec_from_file_location("make_reference", ROOT / "docs/make_reference.py")
+def maker(name: str):
+    spec = importlib.util.spec_from_file_location(name, ROOT / f"docs/{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    assert module.PAGE.read_text() == module.page(), "run docs/make_reference.py"
+    return module
+
+
+def test_the_reference_is_what_the_docstrings_say():
+    made = maker("make_reference")
+    assert made.PAGE.read_text() == made.page(), "run docs/make_reference.py"
+
+
+def test_the_pages_of_the_games_are_what_docstrings_and_bench_say():
+    made = maker("make_games")
+    for name, text in made.pages().items():
+        assert (made.FOLDER / name).read_text() == text, "run docs/make_games.py"
 
 
 def test_links_in_the_pages_lead_somewhere():

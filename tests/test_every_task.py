@@ -44,8 +44,8 @@ def each(games):
         yield pytest.param(game, id=name, marks=marks)
 
 
-every_game = pytest.mark.parametrize("game", each(GAMES))
-every_planar_game = pytest.mark.parametrize("game", each(PLANAR))
+every_game = pytest.mark.parametrize("game", list(each(GAMES)))
+every_planar_game = pytest.mark.parametrize("game", list(each(PLANAR)))
 
 
 @eqx.filter_jit
