@@ -37,6 +37,9 @@ class Measured(NamedTuple):
 
 
 MEASURED = [
+    Measured("formation-di", "zero", 1.569, 0.1, 0.0),
+    Measured("formation-di", "formation-consensus", 0.213, 0.12, 1.0),
+    Measured("formation-di", "formation-linear", 0.1054, 0.12, 1.0),
     Measured("cartpoles", "zero", 9.72, 0.02, 0.0, 1.0),
     Measured("cartpoles", "uniform", 9.76, 0.02, 0.0, 1.0),
     Measured("cartpoles", "cart-lqr", 0.01049, 0.08, 1.0),
@@ -44,6 +47,22 @@ MEASURED = [
     Measured("microgrid", "zero", 0.447, 0.1, 0.009),
     Measured("microgrid", "hold", 0.393, 0.1, 0.093),
     Measured("microgrid", "grid-feedback", 0.00555, 0.08, 1.0),
+    Measured("platoon-catchup", "zero", 0.541, 0.1, 0.0),
+    Measured("platoon-catchup", "uniform", 8.22, 0.05, 0.0, 1.0),
+    Measured("platoon-catchup", "platoon-ovm", 0.1023, 0.1, 1.0),
+    Measured("platoon-catchup", "platoon-linear", 0.0324, 0.1, 1.0),
+    Measured("platoon-slowdown", "zero", 8.28, 0.05, 0.0, 1.0),
+    Measured("platoon-slowdown", "uniform", 8.40, 0.05, 0.0, 1.0),
+    Measured("platoon-slowdown", "platoon-ovm", 0.617, 0.1, 1.0),
+    Measured("platoon-slowdown", "platoon-linear", 0.410, 0.1, 1.0),
+    Measured("platoon-long", "platoon-ovm", 1.18, 0.25, 0.22, 0.18),
+    Measured("platoon-long", "platoon-linear", 0.380, 0.1, 1.0),
+    Measured("quads-planar", "zero", 16.1, 0.05, 0.0, 0.993),
+    Measured("quads-planar", "uniform", 25.1, 0.02, 0.0, 1.0),
+    Measured("quads-planar", "quad-chain", 0.183, 0.15, 0.999),
+    Measured("quads-space", "zero", 18.1, 0.02, 0.0, 1.0),
+    Measured("quads-space", "uniform", 20.6, 0.02, 0.0, 1.0),
+    Measured("quads-space", "quad-chain-space", 0.243, 0.1, 1.0),
 ]
 BENCH = tuple(dict.fromkeys(m.task for m in MEASURED))
 
@@ -137,6 +156,18 @@ def test_a_load_above_563_watts_destabilises_the_microgrid():
     assert radius(540.0) < 1 < radius(610.0)
 
 
+@pytest.mark.parametrize(("controller", "most"), [("platoon-ovm", 1.144), ("platoon-linear", 1.0)])
+def test_how_much_a_disturbance_grows_from_car_to_car(controller, most):
+    """sup |G(jw)|: the optimal velocity law is not string stable, the tuned one is."""
+    game = regulation("platoon-slowdown")
+    law, there = CONTROLLERS[controller](game), game.at_target(game.reset(KEY))
+    u = lambda x: game.plant.limits[0] * law(eqx.tree_at(lambda s: s.x, there, x), KEY)[1, 0]
+    slope = np.asarray(jax.grad(u)(there.x), float)
+    k_h, k_r, k_own = slope[1, 0], slope[0, 1], slope[1, 1]
+    s = 1j * np.geomspace(1e-3, 1e2, 4000)
+    assert np.abs((k_r * s + k_h) / (s**2 - k_own * s + k_h)).max() == pytest.approx(most, abs=2e-3)
+
+
 TINY = """--task.horizon 6 --steps 24 --schedule.environments 2 --schedule.warmup 6
 --schedule.select_episodes 2 --schedule.steps_per_update 6""".split()
 
@@ -154,6 +185,7 @@ FAST = ("microgrid",)  # without a map, and with a holding action
 )
 def test_every_command_takes_it(task, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")  # so that no name is broken
     run = "out/seed0"
 
     def said(*argv, ends=(0,)):

@@ -15,10 +15,12 @@ import numpy as np
 import pytest
 
 from marlyap.games.game import AbstractRegulation
-from marlyap.games.planar import Goals
+from marlyap.games.planar import AbstractPlanar, Goals
+from marlyap.games.quadrotors import Flight
 from marlyap.tasks import TASKS
 from marlyap.tasks.cartpoles import Row
 from marlyap.tasks.microgrid import Loads
+from marlyap.tasks.platoon import Road
 from marlyap.types import State
 
 
@@ -27,10 +29,17 @@ class Case(NamedTuple):
 
     task: str
     parts: Callable[[dict[str, Any]], tuple[Any, Any]]  # x and scenario of a state in the file
+    errors: Callable[[Any], Any] = lambda e: e  # those of the game, ordered as in the file
 
 
 def planar(start):
     return start["x"], Goals(start["goal"])
+
+
+def points(start):
+    x = jnp.concatenate([start["p"], start["v"]], axis=-1)
+    places = jnp.asarray(TASKS["formation-di"].places, x.dtype)
+    return x, Goals(start["centre"][None] + places)
 
 
 def cartpoles(start):
@@ -46,11 +55,32 @@ def microgrid(start):
     return x, Loads(power=power, change=0 * one, changes=changes, line=one, capacitance=one)
 
 
+def platoon(start):
+    h, lead = start["h"], start["v_start"]
+    road = Road(start=lead, swing=0 * lead, gain=jnp.ones_like(h), lag=0 * h)
+    return jnp.stack([h, start["v"], start["u"]], axis=-1), road
+
+
+def quads(task):
+    def parts(start):
+        goal = start["goal"][None] + jnp.asarray(TASKS[task].places, start["goal"].dtype)
+        return start["x"], Flight(goal=goal, gust=0 * goal, begins=0 * goal[0, 0])
+
+    return parts
+
+
 CASES = {
     "rendezvous-unicycle": Case("rendezvous", planar),
     "formation-unicycle": Case("formation", planar),
+    "formation-di": Case("formation-di", points),
     "cartpoles": Case("cartpoles", cartpoles),
     "microgrid": Case("microgrid", microgrid),
+    "platoon-catchup": Case("platoon-catchup", platoon),
+    "platoon-slowdown": Case("platoon-slowdown", platoon),
+    "quads-planar": Case(
+        "quads-planar", quads("quads-planar"), lambda e: e[:, np.array([0, 1, 4, 2, 3, 5])]
+    ),
+    "quads-space": Case("quads-space", quads("quads-space")),
 }
 
 
@@ -87,7 +117,7 @@ def compared(name, kind, close):
     case = CASES[name]
     for told, seen in zip(loaded(name)["trajectories"], played(name, kind), strict=True):
         x, costs, failed, success, errors = seen
-        states = [np.asarray(case.parts(array(s, np.float64))[0]) for s in told["next_states"]]
+        states = [np.asarray(case.parts(array(s, kind))[0]) for s in told["next_states"]]
         want = np.array(states)
         np.testing.assert_allclose(x, want, rtol=close, atol=close * (1 + np.abs(want).max()))
         want = np.array(told["costs"])
@@ -95,8 +125,8 @@ def compared(name, kind, close):
         assert np.array_equal(failed, told["failed"]), name
         assert bool(success) == told["success_at_end"], name
         want = np.array(told["errors_at_end"])
-        got = np.asarray(errors)
-        if CASES[name].task in ("rendezvous", "formation"):  # in the world's frame there
+        got = np.asarray(case.errors(errors))
+        if isinstance(TASKS[case.task], AbstractPlanar):  # in the world's frame there
             got, want = (np.linalg.norm(e[:, :2], axis=1) for e in (got, want))
         np.testing.assert_allclose(got, want, rtol=close, atol=close * (1 + np.abs(want).max()))
 

@@ -6,12 +6,24 @@ from marlyap.controllers.controller import (
     AbstractController as AbstractController,
     as_action as as_action,
 )
+from marlyap.controllers.formation_feedback import (
+    FormationConsensus as FormationConsensus,
+    FormationFeedback as FormationFeedback,
+)
 from marlyap.controllers.gradient import GradientConsensus as GradientConsensus
 from marlyap.controllers.grid_feedback import GridFeedback as GridFeedback
 from marlyap.controllers.lin_francis_maggiore import LinFrancisMaggiore as LinFrancisMaggiore
 from marlyap.controllers.optimal import OptimalControl as OptimalControl, Replayed as Replayed
+from marlyap.controllers.platoon_feedback import (
+    PlatoonLinear as PlatoonLinear,
+    PlatoonOVM as PlatoonOVM,
+)
 from marlyap.controllers.point_offset import PointOffset as PointOffset
 from marlyap.controllers.pursuit import TreePursuit as TreePursuit
+from marlyap.controllers.quad_chain import (
+    QuadChain as QuadChain,
+    QuadChainSpace as QuadChainSpace,
+)
 from marlyap.controllers.reference import (
     Hold as Hold,
     UniformlyRandom as UniformlyRandom,
@@ -25,9 +37,15 @@ CONTROLLERS: dict[str, type[AbstractController]] = {
     "lin-francis-maggiore": LinFrancisMaggiore,
     "tree-pursuit": TreePursuit,
     "optimal-control": OptimalControl,
+    "formation-consensus": FormationConsensus,
+    "formation-linear": FormationFeedback,
     "cart-lqr": CartLQR,
     "cart-feedback": CartFeedback,
     "grid-feedback": GridFeedback,
+    "platoon-ovm": PlatoonOVM,
+    "platoon-linear": PlatoonLinear,
+    "quad-chain": QuadChain,
+    "quad-chain-space": QuadChainSpace,
     "zero": Zero,
     "hold": Hold,
     "uniform": UniformlyRandom,

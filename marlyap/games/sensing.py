@@ -19,7 +19,7 @@ def into_frame(h: Float[Array, "2"], v: Float[Array, "*n 2"]) -> Float[Array, "*
     return jnp.stack([along, left], axis=-1)
 
 
-def near(v: Float[Array, "*n 2"], scale: float) -> Float[Array, "*n 2"]:
+def near(v: Float[Array, "*n d"], scale: float) -> Float[Array, "*n d"]:
     """v / (|v| + scale): the direction far away, and close by a magnified v.
 
     A network fed with metres alone cannot tell centimetres apart.

@@ -3,7 +3,13 @@
 from marlyap.games.dynamics import LateUnicycle, Unicycle
 from marlyap.tasks.cartpoles import CartPoles as CartPoles
 from marlyap.tasks.formation import Formation as Formation
+from marlyap.tasks.formation_di import DisplacementFormation as DisplacementFormation
 from marlyap.tasks.microgrid import Microgrid as Microgrid
+from marlyap.tasks.platoon import Platoon as Platoon
+from marlyap.tasks.quads import (
+    PlanarFormation as PlanarFormation,
+    SpaceFormation as SpaceFormation,
+)
 from marlyap.tasks.rendezvous import Rendezvous as Rendezvous
 
 
@@ -14,6 +20,12 @@ TASKS = {
     "rendezvous-late": Rendezvous(dynamics=LateUnicycle()),
     "rendezvous-rest": Rendezvous(rest_weight=0.03, horizon=60),
     "formation": Formation(),
+    "formation-di": DisplacementFormation(),
     "cartpoles": CartPoles(),
     "microgrid": Microgrid(),
+    "platoon-catchup": Platoon(),
+    "platoon-slowdown": Platoon(start_headway=(1.0, 1.0), start_speed=(1.5, 2.5)),
+    "platoon-long": Platoon(16, start_headway=(1.0, 1.0), start_speed=(1.5, 2.5)),
+    "quads-planar": PlanarFormation(),
+    "quads-space": SpaceFormation(),
 }

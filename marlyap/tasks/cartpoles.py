@@ -187,7 +187,7 @@ class CartPoles(AbstractRegulation):
         return super().state_shapes(state) | {"x": (state.x, (self.agents, 4))}
 
 
-def check_weights(weights: tuple[float, ...], errors: int) -> None:
+def check_weights(weights: tuple[float, ...], errors: int, name: str = "weights") -> None:
     """Raise UserError unless there is a weight >= 0 for each error."""
     if len(weights) != errors or not all(0 <= w < 1e6 for w in weights):
-        raise UserError(f"weights: {weights} must be {errors} numbers, each 0 or more.")
+        raise UserError(f"{name}: {weights} must be {errors} numbers, each 0 or more.")
