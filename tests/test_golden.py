@@ -18,6 +18,8 @@ from marlyap.games.game import AbstractRegulation
 from marlyap.games.planar import Goals
 from marlyap.tasks import TASKS
 from marlyap.tasks.cartpoles import Row
+from marlyap.tasks.consensus import Hearing
+from marlyap.tasks.estimation import Target
 from marlyap.tasks.microgrid import Loads
 from marlyap.types import State
 
@@ -46,11 +48,25 @@ def microgrid(start):
     return x, Loads(power=power, change=0 * one, changes=changes, line=one, capacitance=one)
 
 
+SEED = jnp.zeros(2, jnp.uint32)  # of noise that is not there
+
+
+def consensus(start):
+    return start["d"][..., None], Hearing(SEED)
+
+
+def estimation(start):
+    return start["e"], Target(start["z"], SEED)
+
+
 CASES = {
     "rendezvous-unicycle": Case("rendezvous", planar),
     "formation-unicycle": Case("formation", planar),
     "cartpoles": Case("cartpoles", cartpoles),
     "microgrid": Case("microgrid", microgrid),
+    "consensus": Case("consensus", consensus),
+    "consensus-unstable": Case("consensus-unstable", consensus),
+    "estimation": Case("estimation", estimation),
 }
 
 

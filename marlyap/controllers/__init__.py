@@ -1,5 +1,9 @@
 """Controllers that are not learnt, to compare with: built in, or in a file of your own."""
 
+from marlyap.controllers.agreement import (
+    ConsensusFilter as ConsensusFilter,
+    Laplacian as Laplacian,
+)
 from marlyap.controllers.cart_feedback import CartFeedback as CartFeedback, CartLQR as CartLQR
 from marlyap.controllers.cascade import Cascade as Cascade
 from marlyap.controllers.controller import (
@@ -28,6 +32,8 @@ CONTROLLERS: dict[str, type[AbstractController]] = {
     "cart-lqr": CartLQR,
     "cart-feedback": CartFeedback,
     "grid-feedback": GridFeedback,
+    "laplacian": Laplacian,
+    "consensus-filter": ConsensusFilter,
     "zero": Zero,
     "hold": Hold,
     "uniform": UniformlyRandom,

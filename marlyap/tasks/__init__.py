@@ -2,6 +2,8 @@
 
 from marlyap.games.dynamics import LateUnicycle, Unicycle
 from marlyap.tasks.cartpoles import CartPoles as CartPoles
+from marlyap.tasks.consensus import Averaging, Consensus as Consensus
+from marlyap.tasks.estimation import Estimation as Estimation
 from marlyap.tasks.formation import Formation as Formation
 from marlyap.tasks.microgrid import Microgrid as Microgrid
 from marlyap.tasks.rendezvous import Rendezvous as Rendezvous
@@ -16,4 +18,7 @@ TASKS = {
     "formation": Formation(),
     "cartpoles": CartPoles(),
     "microgrid": Microgrid(),
+    "consensus": Consensus(),
+    "consensus-unstable": Consensus(plant=Averaging(growth=1.1)),
+    "estimation": Estimation(),
 }
