@@ -49,6 +49,15 @@ MEASURED = [
     Measured("consensus-unstable", "laplacian", 0.01348, 0.06, 1.0),
     Measured("estimation", "zero", 2.085, 0.04, 0.0),
     Measured("estimation", "consensus-filter", 0.00965, 0.04, 1.0),
+    Measured("frequency", "zero", 1.178, 0.05, 0.0),
+    Measured("frequency", "uniform", 1.203, 0.05, 0.0),
+    Measured("frequency", "droop", 0.2205, 0.08, 1.0),
+    Measured("frequency", "steep-droop", 0.2055, 0.08, 1.0),
+    Measured("frequency-weak", "zero", 2.64, 0.05, 0.0),
+    Measured("frequency-weak", "droop", 0.284, 0.08, 0.998),
+    Measured("frequency-step", "zero", 1.228, 0.05, 0.0),
+    Measured("frequency-step", "droop", 0.2236, 0.08, 1.0),
+    Measured("frequency-step", "steep-droop", 0.2080, 0.08, 1.0),
 ]
 QUICK = ("cartpoles", "microgrid")  # whose commands are run every time
 BENCH = [
@@ -99,6 +108,7 @@ UNSTABLE = [
     ("cartpoles", 1.082, 0.003),
     ("consensus-unstable", 1.1, 1e-6),
     ("estimation", 1.01, 1e-6),
+    ("frequency-weak", 1.0011, 5e-5),
 ]
 
 

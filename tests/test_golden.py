@@ -20,6 +20,7 @@ from marlyap.tasks import TASKS
 from marlyap.tasks.cartpoles import Row
 from marlyap.tasks.consensus import Hearing
 from marlyap.tasks.estimation import Target
+from marlyap.tasks.frequency import Disturbance, new_england
 from marlyap.tasks.microgrid import Loads
 from marlyap.types import State
 
@@ -59,6 +60,15 @@ def estimation(start):
     return start["e"], Target(start["z"], SEED)
 
 
+def frequency(start):
+    """There angles count from those without a load, and effort from zero."""
+    load, one = start["load"], jnp.ones((), start["w"].dtype)
+    rest = jnp.asarray(new_england().angle, load.dtype)
+    x = jnp.stack([start["delta"], start["w"]], axis=-1)
+    each, lines = jnp.ones(10, x.dtype), jnp.ones((10, 10), x.dtype)
+    return x, Disturbance(load, 0 * one, rest, inertia=each, damping=each, lines=lines)
+
+
 CASES = {
     "rendezvous-unicycle": Case("rendezvous", planar),
     "formation-unicycle": Case("formation", planar),
@@ -67,6 +77,7 @@ CASES = {
     "consensus": Case("consensus", consensus),
     "consensus-unstable": Case("consensus-unstable", consensus),
     "estimation": Case("estimation", estimation),
+    "frequency": Case("frequency", frequency),
 }
 
 

@@ -10,6 +10,7 @@ from marlyap.controllers.controller import (
     AbstractController as AbstractController,
     as_action as as_action,
 )
+from marlyap.controllers.droop import Droop as Droop, SteepDroop as SteepDroop
 from marlyap.controllers.gradient import GradientConsensus as GradientConsensus
 from marlyap.controllers.grid_feedback import GridFeedback as GridFeedback
 from marlyap.controllers.lin_francis_maggiore import LinFrancisMaggiore as LinFrancisMaggiore
@@ -34,6 +35,8 @@ CONTROLLERS: dict[str, type[AbstractController]] = {
     "grid-feedback": GridFeedback,
     "laplacian": Laplacian,
     "consensus-filter": ConsensusFilter,
+    "droop": Droop,
+    "steep-droop": SteepDroop,
     "zero": Zero,
     "hold": Hold,
     "uniform": UniformlyRandom,

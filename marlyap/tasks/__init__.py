@@ -5,6 +5,7 @@ from marlyap.tasks.cartpoles import CartPoles as CartPoles
 from marlyap.tasks.consensus import Averaging, Consensus as Consensus
 from marlyap.tasks.estimation import Estimation as Estimation
 from marlyap.tasks.formation import Formation as Formation
+from marlyap.tasks.frequency import Frequency as Frequency, SwingEquations
 from marlyap.tasks.microgrid import Microgrid as Microgrid
 from marlyap.tasks.rendezvous import Rendezvous as Rendezvous
 
@@ -21,4 +22,7 @@ TASKS = {
     "consensus": Consensus(),
     "consensus-unstable": Consensus(plant=Averaging(growth=1.1)),
     "estimation": Estimation(),
+    "frequency": Frequency(),
+    "frequency-weak": Frequency(plant=SwingEquations(damping=10 * (-0.2,))),
+    "frequency-step": Frequency(load_step=0.5),
 }
