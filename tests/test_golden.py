@@ -6,6 +6,7 @@ and actions beyond the limits, which have to clip.
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from marlyap.tasks.estimation import Target
 from marlyap.tasks.frequency import Disturbance, new_england
 from marlyap.tasks.microgrid import Loads
 from marlyap.tasks.platoon import Road
+from marlyap.tasks.ring import Traffic
 from marlyap.types import State
 
 
@@ -92,6 +94,22 @@ def frequency(start):
     return x, Disturbance(load, 0 * one, rest, inertia=each, damping=each, lines=lines)
 
 
+def ring(task):
+    def parts(start):
+        game, length = replace(TASKS[task], noise=0.0), start["L"]
+        order, n = game.plant.order(game.agents), game.plant.cars
+        # Laps are counted here, and not in the file: every car is behind the first.
+        line = start["x"][0] - jnp.cumsum(
+            jnp.mod(-jnp.diff(start["x"], prepend=start["x"][:1]), length)
+        )
+        flow = game.plant.flow(length / n - game.plant.size)
+        seed = jax.random.key_data(jax.random.key(0))
+        x = jnp.stack([line, start["v"]], axis=-1)[order]
+        return x, Traffic(length=length, flow=flow, noise=0 * length, seed=seed)
+
+    return parts
+
+
 CASES = {
     "rendezvous-unicycle": Case("rendezvous", planar),
     "formation-unicycle": Case("formation", planar),
@@ -108,6 +126,8 @@ CASES = {
     "consensus-unstable": Case("consensus-unstable", consensus),
     "estimation": Case("estimation", estimation),
     "frequency": Case("frequency", frequency),
+    "ring": Case("ring", ring("ring"), lambda e: e.reshape(-1, 2)),
+    "ring2": Case("ring2", ring("ring2"), lambda e: e.reshape(-1, 2)),
 }
 
 

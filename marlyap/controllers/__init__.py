@@ -34,6 +34,11 @@ from marlyap.controllers.reference import (
     UniformlyRandom as UniformlyRandom,
     Zero as Zero,
 )
+from marlyap.controllers.ring_feedback import (
+    FollowerStopper as FollowerStopper,
+    RingHuman as RingHuman,
+    RingLinear as RingLinear,
+)
 
 
 CONTROLLERS: dict[str, type[AbstractController]] = {
@@ -55,6 +60,9 @@ CONTROLLERS: dict[str, type[AbstractController]] = {
     "consensus-filter": ConsensusFilter,
     "droop": Droop,
     "steep-droop": SteepDroop,
+    "follower-stopper": FollowerStopper,
+    "ring-linear": RingLinear,
+    "ring-human": RingHuman,
     "zero": Zero,
     "hold": Hold,
     "uniform": UniformlyRandom,

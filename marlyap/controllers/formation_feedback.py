@@ -54,6 +54,7 @@ class FormationFeedback(AbstractController):
     own: tuple[float, ...] = (11.57, 1.03, 1.49, 1.02, 1.36)  # of the own velocity (1/s)
 
     def __check_init__(self):
+        super().__check_init__()
         needs_a_chain(self.game, len(self.own))
 
     def __call__(self, state, key) -> Action:

@@ -28,6 +28,7 @@ class QuadChain(AbstractController):
     most: float = 3.0  # largest acceleration to the side that is asked for (m/s^2)
 
     def __check_init__(self):
+        super().__check_init__()
         needs_a_chain(self.game)
 
     def __call__(self, state, key):
@@ -60,6 +61,7 @@ class QuadChainSpace(AbstractController):
     most_up: float = 3.0  # m/s^2
 
     def __check_init__(self):
+        super().__check_init__()
         needs_a_chain(self.game)
 
     def __call__(self, state, key):

@@ -14,6 +14,7 @@ from marlyap.tasks.quads import (
     SpaceFormation as SpaceFormation,
 )
 from marlyap.tasks.rendezvous import Rendezvous as Rendezvous
+from marlyap.tasks.ring import Ring as Ring
 
 
 TASKS = {
@@ -37,4 +38,6 @@ TASKS = {
     "frequency": Frequency(),
     "frequency-weak": Frequency(plant=SwingEquations(damping=10 * (-0.2,))),
     "frequency-step": Frequency(load_step=0.5),
+    "ring": Ring(),
+    "ring2": Ring(agents=2),
 }

@@ -221,6 +221,13 @@ class Platoon(AbstractRegulation):
         late = jnp.maximum(state.t, math.ceil(self.plant.ramp / self.dt)).astype(state.t.dtype)
         return eqx.tree_at(lambda s: (s.x, s.t), state, (x, late))
 
+    def farther(self, state, factor):
+        """The start with the leader's speed `factor` times as far off too."""
+        there, cruise = self.at_target(state).x, self.plant.cruise
+        x = there + factor * (state.x - there)
+        start = cruise + factor * (state.scenario.start - cruise)
+        return eqx.tree_at(lambda s: (s.x, s.scenario.start), state, (x, start))
+
     def scene(self, state):
         """The cars on the road, and last the leader, seen from which they are placed."""
         back = jnp.concatenate([-jnp.cumsum(state.x[:, 0]), jnp.zeros(1)])

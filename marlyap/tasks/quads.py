@@ -70,7 +70,7 @@ class AbstractQuads(AbstractRegulation):
         d = len(self.plant.ways)
         centre = jax.random.uniform(k_goal, (d,), minval=-self.size, maxval=self.size)
         return Flight(
-            goal=centre + jnp.asarray(self.places, jnp.float32),
+            goal=centre[None] + jnp.asarray(self.places, jnp.float32),
             gust=self.gust * jax.random.uniform(k_gust, (self.agents, d), minval=-1.0),
             begins=jax.random.uniform(k_time, ()) * self.horizon * self.dt,
         )
