@@ -17,6 +17,7 @@ from marlyap.cli import main
 from marlyap.controllers import CONTROLLERS
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractRegulation
+from marlyap.runs import bench
 from marlyap.simulation.evaluation import evaluate
 from marlyap.tasks import TASKS, Rendezvous
 
@@ -63,6 +64,21 @@ MEASURED = [
     Measured("quads-space", "zero", 18.1, 0.02, 0.0, 1.0),
     Measured("quads-space", "uniform", 20.6, 0.02, 0.0, 1.0),
     Measured("quads-space", "quad-chain-space", 0.243, 0.1, 1.0),
+    Measured("consensus", "zero", 0.300, 0.06, 0.0),
+    Measured("consensus", "laplacian", 0.01124, 0.06, 1.0),
+    Measured("consensus-unstable", "zero", 40.7, 0.06, 0.0, 1.0),
+    Measured("consensus-unstable", "laplacian", 0.01348, 0.06, 1.0),
+    Measured("estimation", "zero", 2.085, 0.04, 0.0),
+    Measured("estimation", "consensus-filter", 0.00965, 0.04, 1.0),
+    Measured("frequency", "zero", 1.178, 0.05, 0.0),
+    Measured("frequency", "uniform", 1.203, 0.05, 0.0),
+    Measured("frequency", "droop", 0.2205, 0.08, 1.0),
+    Measured("frequency", "steep-droop", 0.2055, 0.08, 1.0),
+    Measured("frequency-weak", "zero", 2.64, 0.05, 0.0),
+    Measured("frequency-weak", "droop", 0.284, 0.08, 0.998),
+    Measured("frequency-step", "zero", 1.228, 0.05, 0.0),
+    Measured("frequency-step", "droop", 0.2236, 0.08, 1.0),
+    Measured("frequency-step", "steep-droop", 0.2080, 0.08, 1.0),
     Measured("ring", "zero", 1.885, 0.2, 0.0, 0.094, 100),
     Measured("ring", "ring-human", 0.772, 0.15, 0.0, 0.0, 20),
     Measured("ring", "follower-stopper", 0.1764, 0.3, 1.0, 0.0, 20),
@@ -72,6 +88,21 @@ MEASURED = [
     Measured("ring2", "ring-linear", 0.0994, 0.3, 1.0, 0.0, 20),
 ]
 BENCH = tuple(dict.fromkeys(m.task for m in MEASURED))
+
+
+class Counted:
+    """A function that counts its calls, and is interrupted in one of them."""
+
+    def __init__(self, f, stop=None):
+        self.f, self.stop, self.calls = f, stop, 0
+
+    def __call__(self, *args, **options):
+        self.calls += 1
+        if self.calls == self.stop:
+            raise KeyboardInterrupt
+        return self.f(*args, **options)
+
+
 LOCAL = sorted({(m.task, m.controller) for m in MEASURED if m.controller != "uniform"})
 LONG = ("platoon-long", "ring", "ring2")  # many steps in an episode
 SLOW = (*LONG, "platoon-catchup", "quads-planar", "quads-space")  # or much like another
@@ -122,8 +153,16 @@ def test_a_controller_is_local_bounded_and_finite(task, controller):
         assert changed[j] or controller in ("zero", "hold") or (np.abs(out[0, j]) == 1).all()
 
 
-@pytest.mark.parametrize(("task", "factor"), [("cartpoles", 1.082)])
-def test_without_control_it_diverges(task, factor):
+UNSTABLE = [
+    ("cartpoles", 1.082, 0.003),
+    ("consensus-unstable", 1.1, 1e-6),
+    ("estimation", 1.01, 1e-6),
+    ("frequency-weak", 1.0011, 5e-5),
+]
+
+
+@pytest.mark.parametrize(("task", "factor", "close"), UNSTABLE)
+def test_without_control_it_diverges(task, factor, close):
     """The largest eigenvalue of a step at the target set is what the literature's plant has."""
     game = regulation(task)
     with jax.enable_x64(True):
@@ -134,7 +173,7 @@ def test_without_control_it_diverges(task, factor):
             return game.step(state, game.hold(there)).x.ravel()
 
         A = jax.jacobian(after)(there.x.ravel())
-    assert np.abs(np.linalg.eigvals(np.asarray(A))).max() == pytest.approx(factor, abs=0.003)
+    assert np.abs(np.linalg.eigvals(np.asarray(A))).max() == pytest.approx(factor, abs=close)
 
 
 def test_a_load_above_563_watts_destabilises_the_microgrid():
@@ -209,7 +248,12 @@ def game_has_a_map(task):
     return game.scene(game.reset(KEY)) is not None
 
 
-@pytest.mark.parametrize("task", marked(BENCH, lambda task: task, SLOW))
+FAST = ("microgrid",)  # without a map, and with a holding action
+
+
+@pytest.mark.parametrize(
+    "task", [t if t in FAST else pytest.param(t, marks=pytest.mark.slow) for t in BENCH]
+)
 def test_every_command_takes_it(task, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")  # so that no name is broken
@@ -227,6 +271,9 @@ def test_every_command_takes_it(task, tmp_path, monkeypatch, capsys):
     assert "cost" in (table := capsys.readouterr().out) and ("m/s" in table) == game_has_a_map(task)
     assert said("report", run) and Path(run, "report.html").stat().st_size > 10_000
     assert said("watch", run) and Path(run, "film.gif").read_bytes()[:3] == b"GIF"
+    assert (
+        main(["watch", "hold", "--task", task, "--episode", "2"]) == 0 and Path("film.gif").exists()
+    )
     asked = ("--certificates", "reach", "quantiles", "--rollouts", "1000")
     verdicts = said("certify", run, *asked, ends=(0, 1))
     assert verdicts
@@ -246,3 +293,50 @@ def test_a_controller_of_another_game_is_refused(task, controller):
             elsewhere.__check_init__()
     else:
         elsewhere.__check_init__()
+
+
+def test_the_bench_measures_each_cell_once(tmp_path, monkeypatch, capsys):
+    """Two games and a run of one; stopped in the middle and resumed; then nothing is left."""
+    monkeypatch.chdir(tmp_path)
+    small = "--steps 2000 --schedule.environments 2 --schedule.warmup 1000".split()
+    small += "--schedule.select_episodes 2 --schedule.steps_per_update 500".split()
+    assert main(["train", "cartpoles", "masac", "--out", "r", *small]) == 0
+    monkeypatch.setattr(bench, "evaluate", counted := Counted(evaluate, stop=5))
+    asked = ["bench", "cartpoles", "microgrid", "--quick", "--out", "b", "--runs", "r", "--json"]
+    assert main(asked) == 130
+    assert not Path("b/bench.csv").exists() and len(list(Path("b/cells").rglob("*.json"))) == 4
+    counted.stop = None
+    capsys.readouterr()
+    rows = json.loads((main(asked), capsys.readouterr().out)[1])["rows"]
+    assert counted.calls == 1 + len(rows) and len({r["controller"] for r in rows}) == 7
+    page = Path("b/bench.html").read_text()
+    assert "cart-feedback" in page and "r/seed0" in page and "://" not in page
+    assert Path("b/bench.csv").read_text().count("\n") == 1 + len(rows)
+    by = {(r["game"], r["controller"], r["horizons"]): r for r in rows}
+    assert by["microgrid", "grid-feedback", 2]["success"] == 1.0
+    assert by["cartpoles", "zero", 1]["failed"] == 1.0
+    assert by["cartpoles", "zero", 2]["steps"] == 1000
+    main(asked)
+    assert counted.calls == 1 + len(rows)
+    Path("b/cells/cartpoles/zero-1.json").write_text("{}")
+    main(asked)
+    assert counted.calls == 2 + len(rows)
+
+
+@pytest.mark.parametrize(
+    ("argv", "says"),
+    [
+        (["cartpole"], "did you mean 'cartpoles'"),
+        (["cartpoles", "--controllers", "cart-lrq"], "did you mean 'cart-lqr'"),
+        (["cartpoles", "--controllers", "grid-feedback"], "drives none of these games"),
+        (["cartpoles", "--episodes", "0"], "episodes: 0 is out of range"),
+        (["cartpoles", "--longer", "0"], "longer: 0 is out of range"),
+        (["cartpoles", "--task.agents", "4"], "the bench measures the games as they are"),
+        (["cartpoles", "--runs", "nowhere"], "nowhere"),
+    ],
+)
+def test_what_the_bench_cannot_do_is_one_sentence(argv, says, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["bench", *argv]) == 2
+    said = capsys.readouterr().err
+    assert says in said and said.count("\n") == 1

@@ -417,7 +417,7 @@ def test_names_give_the_members():
     [
         ("rendevous", AbstractGame, ["task: no task is called 'rendevous'", "'rendezvous'?"]),
         ("masca", AbstractAlgorithm, ["algorithm:", "did you mean 'masac'?"]),
-        ("qqqq", AbstractGame, ["there is cartpoles, formation"]),
+        ("qqqq", AbstractGame, ["there is cartpoles, consensus"]),
         ("", AbstractGame, ["task:"]),
         ("masac", AbstractGame, ["task: no task is called 'masac'"]),
         ("nowhere.py:Name", AbstractGame, ["task: there is no file nowhere.py"]),

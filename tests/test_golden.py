@@ -20,6 +20,9 @@ from marlyap.games.planar import AbstractPlanar, Goals
 from marlyap.games.quadrotors import Flight
 from marlyap.tasks import TASKS
 from marlyap.tasks.cartpoles import Row
+from marlyap.tasks.consensus import Hearing
+from marlyap.tasks.estimation import Target
+from marlyap.tasks.frequency import Disturbance, new_england
 from marlyap.tasks.microgrid import Loads
 from marlyap.tasks.platoon import Road
 from marlyap.tasks.ring import Traffic
@@ -71,6 +74,26 @@ def quads(task):
     return parts
 
 
+SEED = jnp.zeros(2, jnp.uint32)  # of noise that is not there
+
+
+def consensus(start):
+    return start["d"][..., None], Hearing(SEED)
+
+
+def estimation(start):
+    return start["e"], Target(start["z"], SEED)
+
+
+def frequency(start):
+    """There angles count from those without a load, and effort from zero."""
+    load, one = start["load"], jnp.ones((), start["w"].dtype)
+    rest = jnp.asarray(new_england().angle, load.dtype)
+    x = jnp.stack([start["delta"], start["w"]], axis=-1)
+    each, lines = jnp.ones(10, x.dtype), jnp.ones((10, 10), x.dtype)
+    return x, Disturbance(load, 0 * one, rest, inertia=each, damping=each, lines=lines)
+
+
 def ring(task):
     def parts(start):
         game, length = replace(TASKS[task], noise=0.0), start["L"]
@@ -99,6 +122,10 @@ CASES = {
         "quads-planar", quads("quads-planar"), lambda e: e[:, np.array([0, 1, 4, 2, 3, 5])]
     ),
     "quads-space": Case("quads-space", quads("quads-space")),
+    "consensus": Case("consensus", consensus),
+    "consensus-unstable": Case("consensus-unstable", consensus),
+    "estimation": Case("estimation", estimation),
+    "frequency": Case("frequency", frequency),
     "ring": Case("ring", ring("ring"), lambda e: e.reshape(-1, 2)),
     "ring2": Case("ring2", ring("ring2"), lambda e: e.reshape(-1, 2)),
 }

@@ -230,6 +230,8 @@ def nudged(
     `what` is the part of the state whose numbers about agents change: x or scenario.
     """
     part = getattr(states, what)
+    if not jax.tree.leaves(_numbers(part)):  # a scenario without a number
+        return states
     values = np.array(jax.vmap(lambda tree: by_agent(tree, game.agents)[0])(_numbers(part)))
     values[np.arange(len(values)), agent, coordinate] += by
     put = lambda tree, row: by_agent(tree, game.agents)[1](row)

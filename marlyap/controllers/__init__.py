@@ -1,11 +1,16 @@
 """Controllers that are not learnt, to compare with: built in, or in a file of your own."""
 
+from marlyap.controllers.agreement import (
+    ConsensusFilter as ConsensusFilter,
+    Laplacian as Laplacian,
+)
 from marlyap.controllers.cart_feedback import CartFeedback as CartFeedback, CartLQR as CartLQR
 from marlyap.controllers.cascade import Cascade as Cascade
 from marlyap.controllers.controller import (
     AbstractController as AbstractController,
     as_action as as_action,
 )
+from marlyap.controllers.droop import Droop as Droop, SteepDroop as SteepDroop
 from marlyap.controllers.formation_feedback import (
     FormationConsensus as FormationConsensus,
     FormationFeedback as FormationFeedback,
@@ -51,6 +56,10 @@ CONTROLLERS: dict[str, type[AbstractController]] = {
     "platoon-linear": PlatoonLinear,
     "quad-chain": QuadChain,
     "quad-chain-space": QuadChainSpace,
+    "laplacian": Laplacian,
+    "consensus-filter": ConsensusFilter,
+    "droop": Droop,
+    "steep-droop": SteepDroop,
     "follower-stopper": FollowerStopper,
     "ring-linear": RingLinear,
     "ring-human": RingHuman,

@@ -6,10 +6,17 @@ agent itself and its neighbours enters (locality).
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from marlyap.games.dynamics import AbstractDynamics
 from marlyap.types import Entry, Links, Obs
+
+
+def noise(
+    seed: UInt32[Array, "2"], t: int | Int[Array, ""], shape: tuple[int, ...]
+) -> Float[Array, "..."]:
+    """Standard normal numbers for step t, drawn by a seed that the state holds."""
+    return jax.random.normal(jax.random.fold_in(jax.random.wrap_key_data(seed), t), shape)
 
 
 def into_frame(h: Float[Array, "2"], v: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:

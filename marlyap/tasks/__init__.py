@@ -2,8 +2,11 @@
 
 from marlyap.games.dynamics import LateUnicycle, Unicycle
 from marlyap.tasks.cartpoles import CartPoles as CartPoles
+from marlyap.tasks.consensus import Averaging, Consensus as Consensus
+from marlyap.tasks.estimation import Estimation as Estimation
 from marlyap.tasks.formation import Formation as Formation
 from marlyap.tasks.formation_di import DisplacementFormation as DisplacementFormation
+from marlyap.tasks.frequency import Frequency as Frequency, SwingEquations
 from marlyap.tasks.microgrid import Microgrid as Microgrid
 from marlyap.tasks.platoon import Platoon as Platoon
 from marlyap.tasks.quads import (
@@ -29,6 +32,12 @@ TASKS = {
     "platoon-long": Platoon(16, start_headway=(1.0, 1.0), start_speed=(1.5, 2.5)),
     "quads-planar": PlanarFormation(),
     "quads-space": SpaceFormation(),
+    "consensus": Consensus(),
+    "consensus-unstable": Consensus(plant=Averaging(growth=1.1)),
+    "estimation": Estimation(),
+    "frequency": Frequency(),
+    "frequency-weak": Frequency(plant=SwingEquations(damping=10 * (-0.2,))),
+    "frequency-step": Frequency(load_step=0.5),
     "ring": Ring(),
     "ring2": Ring(agents=2),
 }

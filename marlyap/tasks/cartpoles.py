@@ -180,6 +180,7 @@ class CartPoles(AbstractRegulation):
             velocity=jnp.concatenate([rows(speed, still), rows(*tip_speed)]),
             goal=rows(goal, still),
             spin=jnp.concatenate([rate, rate]),  # of an agent, its pole's
+            rods=tuple((i, self.agents + i) for i in range(self.agents)),
         )
 
     def state_shapes(self, state):
