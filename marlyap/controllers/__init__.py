@@ -11,9 +11,16 @@ from marlyap.controllers.controller import (
     as_action as as_action,
 )
 from marlyap.controllers.droop import Droop as Droop, SteepDroop as SteepDroop
+from marlyap.controllers.flocking import (
+    Alignment as Alignment,
+    Braking as Braking,
+    FreeFlock as FreeFlock,
+    OlfatiSaber as OlfatiSaber,
+)
 from marlyap.controllers.gradient import GradientConsensus as GradientConsensus
 from marlyap.controllers.grid_feedback import GridFeedback as GridFeedback
 from marlyap.controllers.lin_francis_maggiore import LinFrancisMaggiore as LinFrancisMaggiore
+from marlyap.controllers.lloyd import Lloyd as Lloyd
 from marlyap.controllers.optimal import OptimalControl as OptimalControl, Replayed as Replayed
 from marlyap.controllers.point_offset import PointOffset as PointOffset
 from marlyap.controllers.pursuit import TreePursuit as TreePursuit
@@ -21,6 +28,11 @@ from marlyap.controllers.reference import (
     Hold as Hold,
     UniformlyRandom as UniformlyRandom,
     Zero as Zero,
+)
+from marlyap.controllers.voltage_droop import (
+    DeadBand as DeadBand,
+    LinearVoltage as LinearVoltage,
+    MildDeadBand as MildDeadBand,
 )
 
 
@@ -37,6 +49,14 @@ CONTROLLERS: dict[str, type[AbstractController]] = {
     "consensus-filter": ConsensusFilter,
     "droop": Droop,
     "steep-droop": SteepDroop,
+    "dead-band": DeadBand,
+    "dead-band-mild": MildDeadBand,
+    "linear-voltage": LinearVoltage,
+    "lloyd": Lloyd,
+    "olfati-saber": OlfatiSaber,
+    "olfati-saber-free": FreeFlock,
+    "alignment": Alignment,
+    "braking": Braking,
     "zero": Zero,
     "hold": Hold,
     "uniform": UniformlyRandom,

@@ -3,11 +3,15 @@
 from marlyap.games.dynamics import LateUnicycle, Unicycle
 from marlyap.tasks.cartpoles import CartPoles as CartPoles
 from marlyap.tasks.consensus import Averaging, Consensus as Consensus
+from marlyap.tasks.coverage import Coverage as Coverage
 from marlyap.tasks.estimation import Estimation as Estimation
+from marlyap.tasks.flock import Flock as Flock
 from marlyap.tasks.formation import Formation as Formation
 from marlyap.tasks.frequency import Frequency as Frequency, SwingEquations
+from marlyap.tasks.gnn_flock import GnnFlock as GnnFlock
 from marlyap.tasks.microgrid import Microgrid as Microgrid
 from marlyap.tasks.rendezvous import Rendezvous as Rendezvous
+from marlyap.tasks.voltage import PowerFlow, Voltage as Voltage
 
 
 TASKS = {
@@ -25,4 +29,14 @@ TASKS = {
     "frequency": Frequency(),
     "frequency-weak": Frequency(plant=SwingEquations(damping=10 * (-0.2,))),
     "frequency-step": Frequency(load_step=0.5),
+    "voltage13": Voltage(),
+    "voltage33": Voltage(
+        agents=6,
+        plant=PowerFlow(limits=(1.0,), buses="33", inverters=(12, 17, 21, 24, 28, 32)),
+    ),
+    "coverage": Coverage(),
+    "coverage-bump": Coverage(bump=True),
+    "flock": Flock(),
+    "gnn-flock": GnnFlock(),
+    "gnn-flock-slow": GnnFlock(speed=1.0),
 }
