@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from marlyap.cli import main
-from marlyap.controllers import CONTROLLERS
+from marlyap.controllers import CONTROLLERS, AbstractController
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractRegulation
 from marlyap.runs import bench
@@ -86,6 +86,26 @@ MEASURED = [
     Measured("ring2", "zero", 3.878, 0.01, 0.0, 1.0, 20),
     Measured("ring2", "follower-stopper", 0.0916, 0.3, 1.0, 0.0, 20),
     Measured("ring2", "ring-linear", 0.0994, 0.3, 1.0, 0.0, 20),
+    Measured("coverage", "zero", 2.09, 0.08, 0.0),
+    Measured("coverage", "lloyd", 0.277, 0.05, 1.0),
+    Measured("coverage-bump", "lloyd", 0.323, 0.05, 1.0),
+    Measured("flock", "zero", 20.7, 0.08, 0.0),
+    Measured("flock", "olfati-saber", 1.008, 0.05, 0.971),
+    Measured("flock", "olfati-saber-free", 43.8, 0.12, 0.0),
+    Measured("gnn-flock", "zero", 5.685, 0.05, 0.0),
+    Measured("gnn-flock", "alignment", 0.557, 0.05, 0.306),
+    Measured("gnn-flock", "braking", 0.2242, 0.05, 1.0),
+    Measured("gnn-flock-slow", "zero", 0.632, 0.05, 0.0),
+    Measured("gnn-flock-slow", "alignment", 0.0326, 0.25, 0.948),
+    Measured("gnn-flock-slow", "braking", 0.0094, 0.05, 1.0),
+    Measured("voltage13", "zero", 1.320, 0.15, 0.019),
+    Measured("voltage13", "uniform", 3.55, 0.5, 0.0, 0.055),
+    Measured("voltage13", "dead-band-mild", 0.0895, 0.15, 0.996),
+    Measured("voltage13", "dead-band", 0.0623, 0.15, 1.0),
+    Measured("voltage33", "zero", 0.478, 0.15, 0.331),
+    Measured("voltage33", "uniform", 32.2, 0.1, 0.0, 0.655),
+    Measured("voltage33", "dead-band-mild", 0.0197, 0.15, 1.0),
+    Measured("voltage33", "dead-band", 0.0163, 0.15, 1.0),
 ]
 BENCH = tuple(dict.fromkeys(m.task for m in MEASURED))
 
@@ -103,16 +123,17 @@ class Counted:
         return self.f(*args, **options)
 
 
-LOCAL = sorted({(m.task, m.controller) for m in MEASURED if m.controller != "uniform"})
-LONG = ("platoon-long", "ring", "ring2")  # many steps in an episode
-SLOW = (*LONG, "platoon-catchup", "quads-planar", "quads-space")  # or much like another
+GLOBAL = ("uniform", "braking")  # not made of what each agent knows
+LOCAL = sorted({(m.task, m.controller) for m in MEASURED if m.controller not in GLOBAL})
+SILENT = ("zero", "hold", "dead-band", "dead-band-mild")  # near the target
+FAST = ("cartpoles", "consensus", "microgrid", "platoon-slowdown", "voltage13")  # one of each kind
 
 
-def marked(cases, task, slow=LONG):
-    """Those of tasks that take long are slow."""
-    name = lambda case: case if isinstance(case, str) else "-".join(case[:2])
-    slowly = lambda case: [pytest.mark.slow] if task(case) in slow else []
-    return [pytest.param(case, marks=slowly(case), id=name(case)) for case in cases]
+def marked(cases, task=lambda case: case[0], fast=FAST):
+    """Those of other tasks are slow, all in all."""
+    name = lambda case: "-".join(case[:2]) if isinstance(case, tuple) else case
+    marks = lambda case: [] if task(case) in fast else [pytest.mark.slow]
+    return [pytest.param(case, marks=marks(case), id=name(case)) for case in cases]
 
 
 def regulation(task):
@@ -121,7 +142,7 @@ def regulation(task):
     return game
 
 
-@pytest.mark.parametrize("known", marked(MEASURED, lambda m: m.task))
+@pytest.mark.parametrize("known", marked(MEASURED))
 def test_a_controller_reaches_what_was_measured(known):
     game, n = TASKS[known.task], known.episodes
     found = evaluate(game, CONTROLLERS[known.controller](game), n).summary()
@@ -131,9 +152,10 @@ def test_a_controller_reaches_what_was_measured(known):
     assert found["failed"]["success_rate"] == about(known.failed)
 
 
-@pytest.mark.parametrize(("task", "controller"), LOCAL)
-def test_a_controller_is_local_bounded_and_finite(task, controller):
+@pytest.mark.parametrize("case", marked(LOCAL))
+def test_a_controller_is_local_bounded_and_finite(case):
     """Row i changes with agent j only if they are linked, and even far away it is an action."""
+    task, controller = case
     game = regulation(task)
     law = CONTROLLERS[controller](game)
     act = eqx.filter_jit(lambda states: jax.vmap(lambda s: law(s, KEY))(states))
@@ -150,7 +172,8 @@ def test_a_controller_is_local_bounded_and_finite(task, controller):
     for j in range(game.agents):
         changed = (out[1 + j] != out[0]).any(axis=1)
         assert not (changed & ~linked[:, j]).any()
-        assert changed[j] or controller in ("zero", "hold") or (np.abs(out[0, j]) == 1).all()
+        still = controller in SILENT or (np.abs(out[0, j]) == 1).all()
+        assert changed[j] or still
 
 
 UNSTABLE = [
@@ -264,12 +287,7 @@ def game_has_a_map(task):
     return game.scene(game.reset(KEY)) is not None
 
 
-FAST = ("microgrid",)  # without a map, and with a holding action
-
-
-@pytest.mark.parametrize(
-    "task", [t if t in FAST else pytest.param(t, marks=pytest.mark.slow) for t in BENCH]
-)
+@pytest.mark.parametrize("task", marked(BENCH, lambda task: task, ("microgrid",)))
 def test_every_command_takes_it(task, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")  # so that no name is broken
@@ -306,9 +324,9 @@ def test_a_controller_of_another_game_is_refused(task, controller):
     elsewhere = eqx.tree_at(lambda c: c.game, law, Rendezvous())
     if law.drives:
         with pytest.raises(UserError, match=f"^controller: {type(law).__name__} drives .* not Uni"):
-            elsewhere.__check_init__()
+            AbstractController.__check_init__(elsewhere)
     else:
-        elsewhere.__check_init__()
+        AbstractController.__check_init__(elsewhere)
 
 
 def test_the_bench_measures_each_cell_once(tmp_path, monkeypatch, capsys):

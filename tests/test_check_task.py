@@ -504,6 +504,33 @@ def test_a_steep_penalty_is_no_jump():
     assert faults == () and figures["slope"] > 2.5
 
 
+class Falls(WorldIsATorus):
+    """Where the world would jump the team has failed."""
+
+    def failed(self, state):
+        return ~jnp.all(jnp.abs(state.x) < 0.9)
+
+    @property
+    def failure_cost(self):
+        return 10.0
+
+
+class Coarse(CostJumps):
+    """It says that its costs jump."""
+
+    @property
+    def smooth(self):
+        return False
+
+
+def test_a_jump_that_is_a_failure_is_none():
+    assert only("smooth_step", WorldIsATorus())[0] and not only("smooth_step", Falls())[0]
+
+
+def test_costs_may_jump_where_the_game_says_so():
+    assert only("smooth_cost", CostJumps())[0] and not only("smooth_cost", Coarse())[0]
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_slopes_tell_steepness_from_jumps_and_roots(seed):
     """On one probe for all: the cost as a function of the gap between agents, in NumPy."""

@@ -5,6 +5,7 @@ every law of `LAWS` on them. PettingZoo's checks, by comparison, look at one ste
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -102,11 +103,20 @@ def _remedy(error: Exception) -> str:
 # --- What is examined -----------------------------------------------------------------------------
 
 
-METHODS = {"obs": "observe", "unlinked": "observe", "next": "step"}  # others: as their key
+METHODS = {
+    "obs": "observe",
+    "unlinked": "observe",
+    "fails": "failed",
+    "next": "step",
+}  # others: as their key
 
 
 def see(game: AbstractGame, state: State, action: Action) -> dict[str, Any]:
-    """Everything a game says of one state and action; `unlinked` is `observe` without links."""
+    """Everything a game says of one state and action.
+
+    `unlinked` is `observe` without links, `fails` whether the step ends in a failure.
+    """
+    after = game.step(state, action)
     return {
         "obs": game.observations(state),
         "unlinked": game.observe(state, jnp.zeros((game.agents, game.agents), bool)),
@@ -122,7 +132,8 @@ def see(game: AbstractGame, state: State, action: Action) -> dict[str, Any]:
         "hold": game.hold(state),
         "terminated": game.terminated(state),
         "linked": game.linked(state),
-        "next": game.step(state, action),
+        "fails": game.failed(after),
+        "next": after,
     }
 
 
@@ -657,7 +668,9 @@ def violations(probe: Probe) -> Faults:
 
 
 def smooth_cost(probe: Probe) -> Faults:
-    """Costs are Lipschitz in states and actions (Assumption 1)."""
+    """Costs are Lipschitz in states and actions (Assumption 1), where the game says so."""
+    if not probe.game.smooth:
+        return
     before, last = _steepest(probe, lambda out: out["cost"][:, None])
     probe.figures["slope"] = last
     if not last <= STEEPER * max(before, 1e-3):
@@ -701,21 +714,23 @@ def _steepest(probe: Probe, f: Callable[[dict[str, Any]], Any]) -> tuple[float, 
     back = _unflat(probe.states)
     size = lambda a: np.sqrt(np.sum(np.square(a.reshape(ROWS, -1).astype(float)), axis=1))
 
-    def at(share: Any) -> tuple[Any, Any, Any]:
-        """State, action and f at this share of the way from the near ends to the far ones."""
+    def at(share: Any) -> tuple[Any, Any, Any, Any]:
+        """State, action, f and failure at this share of the way from the near ends to the far."""
         weigh = lambda a: share.reshape(-1, *[1] * (a.ndim - 1)).astype(float)
         x, action = (
             (a + weigh(a) * (b - a)).astype(a.dtype) for a, b in zip(near, far, strict=True)
         )
-        return x, action, f(probe.look(back(x), action)).astype(float)
+        out = probe.look(back(x), action)
+        return x, action, f(out).astype(float), out["failed"] | out["fails"]
 
     begin, quarter, slopes = np.zeros(ROWS), 0.25, []
     for _ in range(HALVINGS + 1):
         points = [at(begin + k * quarter) for k in range(5)]
         rises = []
-        for (x, a, y), (x_next, a_next, y_next) in zip(points, points[1:], strict=False):
+        for (x, a, y, lost), (x_next, a_next, y_next, lost_next) in itertools.pairwise(points):
             gap = np.hypot(size(x_next - x), size(a_next - a))
-            rises.append(np.where(gap > 1e-6, size(y_next - y) / np.maximum(gap, 1e-6), 0.0))
+            counts = (gap > 1e-6) & ~lost & ~lost_next
+            rises.append(np.where(counts, size(y_next - y) / np.maximum(gap, 1e-6), 0.0))
         slopes.append(float(np.max(rises)))
         steepest = begin + np.argmax(rises, axis=0) * quarter
         begin = np.clip(steepest - quarter / 2, 0.0, 1 - 2 * quarter)

@@ -11,6 +11,12 @@ from marlyap.controllers.controller import (
     as_action as as_action,
 )
 from marlyap.controllers.droop import Droop as Droop, SteepDroop as SteepDroop
+from marlyap.controllers.flocking import (
+    Alignment as Alignment,
+    Braking as Braking,
+    FreeFlock as FreeFlock,
+    OlfatiSaber as OlfatiSaber,
+)
 from marlyap.controllers.formation_feedback import (
     FormationConsensus as FormationConsensus,
     FormationFeedback as FormationFeedback,
@@ -18,6 +24,7 @@ from marlyap.controllers.formation_feedback import (
 from marlyap.controllers.gradient import GradientConsensus as GradientConsensus
 from marlyap.controllers.grid_feedback import GridFeedback as GridFeedback
 from marlyap.controllers.lin_francis_maggiore import LinFrancisMaggiore as LinFrancisMaggiore
+from marlyap.controllers.lloyd import Lloyd as Lloyd
 from marlyap.controllers.optimal import OptimalControl as OptimalControl, Replayed as Replayed
 from marlyap.controllers.platoon_feedback import (
     PlatoonLinear as PlatoonLinear,
@@ -38,6 +45,11 @@ from marlyap.controllers.ring_feedback import (
     FollowerStopper as FollowerStopper,
     RingHuman as RingHuman,
     RingLinear as RingLinear,
+)
+from marlyap.controllers.voltage_droop import (
+    DeadBand as DeadBand,
+    LinearVoltage as LinearVoltage,
+    MildDeadBand as MildDeadBand,
 )
 
 
@@ -63,6 +75,14 @@ CONTROLLERS: dict[str, type[AbstractController]] = {
     "follower-stopper": FollowerStopper,
     "ring-linear": RingLinear,
     "ring-human": RingHuman,
+    "dead-band": DeadBand,
+    "dead-band-mild": MildDeadBand,
+    "linear-voltage": LinearVoltage,
+    "lloyd": Lloyd,
+    "olfati-saber": OlfatiSaber,
+    "olfati-saber-free": FreeFlock,
+    "alignment": Alignment,
+    "braking": Braking,
     "zero": Zero,
     "hold": Hold,
     "uniform": UniformlyRandom,

@@ -9,8 +9,8 @@ from marlyap.tasks.platoon import Cars, Platoon
 class PlatoonOVM(AbstractController):
     """The optimal velocity model u = alpha (V(h) - v) + beta (v_ahead - v).
 
-    Bando, Hasebe, Nakayama, Shibata and Sugiyama, Physical Review E 51(2), 1995, with the
-    largest gains that Chu, Chinchali and Katti (ICLR 2020) let their agents choose. It is not string
+    Bando, Hasebe, Nakayama, Shibata and Sugiyama, Physical Review E 51(2), 1995, with the largest
+    gains that Chu, Chinchali and Katti (ICLR 2020) let their agents choose. It is not string
     stable: from car to car speeds grow by up to 1.16, at 0.65 rad/s, so long platoons collide.
     """
 

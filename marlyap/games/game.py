@@ -107,6 +107,11 @@ class AbstractGame(eqx.Module):
         """Coordinates that are all zero exactly on the target set; none where there is none."""
         return jnp.zeros((self.agents, 0))
 
+    @property
+    def smooth(self) -> bool:
+        """Whether costs are Lipschitz, as Assumption 1 has it; not where a grid makes them jump."""
+        return True
+
     def rewards(self, state: State, action: Action) -> Float[Array, "agent"]:
         """r_i(s, a); the team's reward r is their mean."""
         return -self.costs(state, action)

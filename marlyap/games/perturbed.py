@@ -176,6 +176,10 @@ class Perturbed(AbstractRegulation):
         return self.inner.unit
 
     @property
+    def smooth(self):
+        return self.inner.smooth
+
+    @property
     def tolerances(self):
         return self.inner.tolerances
 

@@ -26,6 +26,12 @@ def into_frame(h: Float[Array, "2"], v: Float[Array, "*n 2"]) -> Float[Array, "*
     return jnp.stack([along, left], axis=-1)
 
 
+def length(v: Float[Array, "*n d"]) -> Float[Array, "*n"]:
+    """|v|, with the derivative 0 at 0, where a root has none."""
+    squared = jnp.sum(v * v, axis=-1)
+    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+
+
 def near(v: Float[Array, "*n d"], scale: float) -> Float[Array, "*n d"]:
     """v / (|v| + scale): the direction far away, and close by a magnified v.
 

@@ -3,10 +3,13 @@
 from marlyap.games.dynamics import LateUnicycle, Unicycle
 from marlyap.tasks.cartpoles import CartPoles as CartPoles
 from marlyap.tasks.consensus import Averaging, Consensus as Consensus
+from marlyap.tasks.coverage import Coverage as Coverage
 from marlyap.tasks.estimation import Estimation as Estimation
+from marlyap.tasks.flock import Flock as Flock
 from marlyap.tasks.formation import Formation as Formation
 from marlyap.tasks.formation_di import DisplacementFormation as DisplacementFormation
 from marlyap.tasks.frequency import Frequency as Frequency, SwingEquations
+from marlyap.tasks.gnn_flock import GnnFlock as GnnFlock
 from marlyap.tasks.microgrid import Microgrid as Microgrid
 from marlyap.tasks.platoon import Platoon as Platoon
 from marlyap.tasks.quads import (
@@ -15,6 +18,7 @@ from marlyap.tasks.quads import (
 )
 from marlyap.tasks.rendezvous import Rendezvous as Rendezvous
 from marlyap.tasks.ring import Ring as Ring
+from marlyap.tasks.voltage import PowerFlow, Voltage as Voltage
 
 
 TASKS = {
@@ -40,4 +44,14 @@ TASKS = {
     "frequency-step": Frequency(load_step=0.5),
     "ring": Ring(),
     "ring2": Ring(agents=2),
+    "voltage13": Voltage(),
+    "voltage33": Voltage(
+        agents=6,
+        plant=PowerFlow(limits=(1.0,), buses="33", inverters=(12, 17, 21, 24, 28, 32)),
+    ),
+    "coverage": Coverage(),
+    "coverage-bump": Coverage(bump=True),
+    "flock": Flock(),
+    "gnn-flock": GnnFlock(),
+    "gnn-flock-slow": GnnFlock(speed=1.0),
 }

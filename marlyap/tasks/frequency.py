@@ -1,8 +1,5 @@
 """Frequency: machines of a transmission grid, coupled by its lines, return to the nominal one."""
 
-import json
-from functools import lru_cache
-from pathlib import Path
 from typing import ClassVar
 
 import equinox as eqx
@@ -16,42 +13,12 @@ from marlyap.games.game import AbstractRegulation, Tolerance
 from marlyap.games.physics import AbstractPlant, Integrator
 from marlyap.games.sensing import beside, beside_entries
 from marlyap.tasks.cartpoles import check_weights
+from marlyap.tasks.networks import new_england
 from marlyap.types import Entry, Scalar, State
 
 
 STRONGEST = "0-7,0-8,0-9,1-9,2-9,5-9,5-6,3-5,3-4"  # the spanning tree of the largest K_ij
 CORRECTIONS = 30  # of the angles at which the lines carry a load; each leaves less than half
-
-
-class Network(eqx.Module):
-    """The machines' couplings and their angles in the solved power flow, as NumPy arrays."""
-
-    K: Float[np.ndarray, "agent agent"]  # K_ij (p.u. on 100 MVA)
-    angle: Float[np.ndarray, "agent"]  # of the rotors, about their mean (rad)
-
-    def flow(self, angle: Array, stronger: Array) -> Array:
-        """What leaves each machine, lines being `stronger` times as strong (p.u.)."""
-        K = jnp.asarray(self.K) * stronger
-        return jnp.sum(K * jnp.sin(angle[:, None] - angle[None, :]), axis=1)
-
-    @property
-    def stiffness(self) -> Float[np.ndarray, "agent agent"]:
-        """d flow / d angle at the solved power flow (p.u./rad)."""
-        K = self.K * np.cos(self.angle[:, None] - self.angle[None, :])
-        return np.diag(K.sum(axis=1)) - K
-
-
-@lru_cache(maxsize=1)
-def new_england() -> Network:
-    """The New England system, 39 buses and ten machines, reduced to its machines (Kron).
-
-    K_ij = |E_i E_j Y_ij| from the solved power flow of MATPOWER's case39 and the transient
-    reactances of Athay, Podmore and Virmani, IEEE Trans. Power Apparatus and Systems 98(2), 1979;
-    loads are impedances, and losses are left out.
-    """
-    data = json.loads((Path(__file__).parent / "data" / "ieee39.json").read_text())
-    K, angle = np.array(data["K"]), np.array(data["delta"])
-    return Network(K * (1 - np.eye(len(K))), angle - angle.mean())
 
 
 class Disturbance(eqx.Module):
