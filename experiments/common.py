@@ -179,7 +179,7 @@ def fill(name: str, cases: Sequence[Case], args: argparse.Namespace) -> None:
     train(list(runs.values()), args.quick)
     for case, seed in wanted:
         run = runs[key(case, seed)]
-        if not run.finished:  # given up
+        if not run.finished:  # it diverged
             continue
         about = case.about | {"seed": seed}
         controller = run.controller()
@@ -200,7 +200,7 @@ def fill(name: str, cases: Sequence[Case], args: argparse.Namespace) -> None:
 
 
 def train(runs: list[Run], quick: bool) -> None:
-    """Train to the end, or until a number stops being finite: those are given up.
+    """Train to the end, or until a number stops being finite: those diverged.
 
     With `quick`, one after the other in this process.
     """
@@ -222,7 +222,7 @@ def train(runs: list[Run], quick: bool) -> None:
                 if len(given_up) == before:
                     raise
     for event in given_up:
-        print(f"given up: {event.says}")
+        print(f"diverged: {event.says}")
     if stop():
         raise SystemExit(stop.code)
 

@@ -10,7 +10,7 @@ it small and not to make it fall.
     ./run python experiments/headline.py --quick    seconds, to see that it works
     ./run python experiments/headline.py --draw     the figures again, from the tables alone
 
-Runs are kept in --runs and gone on with when the script is started again.
+Runs are kept in --runs and resumed when the script is started again.
 """
 
 from collections import defaultdict

@@ -54,6 +54,8 @@ class Scene(eqx.Module):
     frame: Float[Array, "body d d"] | None = None  # rows: the body's own axes
     goal: Float[Array, "agent d"] | None = None  # m; None where no place has to be reached
     spin: Float[Array, "body"] | None = None  # rad/s; None where the state does not hold it
+    # Pairs of bodies that a rod joins; the second is drawn in the colour of the first.
+    rods: tuple[tuple[int, int], ...] = eqx.field(default=(), static=True)
 
 
 class Transition(eqx.Module):

@@ -757,7 +757,8 @@ def _(n):
     result = certify(game, controller, {"reach": Reach(rollouts=n, share=0.5)}, 1, 0.99)
     with tempfile.TemporaryDirectory() as folder:
         save(Path(folder) / "c", result, game, controller)
-        return refused(lambda: recheck(Path(folder) / "c"))
+        found = recheck(Path(folder) / "c")
+    return Answer(found["agrees"] or "reach" in found["rechecked"], str(found["not_rechecked"]))
 
 
 # --- The table ----------------------------------------------------------------------------------

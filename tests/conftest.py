@@ -17,6 +17,14 @@ import pytest
 jax.config.update("jax_numpy_rank_promotion", "raise")
 os.environ["MARLYAP_PROGRAMS"] = ""  # a test may change the code that was traced
 
+# XLA's newer code generator for fused loops takes a third of the time to compile, and tests mostly
+# compile. XLA reads its flags once, when the first program is compiled; a child process inherits
+# them, so that both find the same code in the cache. An XLA that lacks a flag aborts, so the flag
+# is left out for versions of JAX that came later.
+PLAIN = "--xla_cpu_use_fusion_emitters=false"
+if PLAIN not in os.environ.get("XLA_FLAGS", "") and jax.__version_info__ < (0, 11):
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {PLAIN}".strip()
+
 MAPS = 25_000  # in use when a module ends; one module adds up to 10,000
 
 
@@ -59,6 +67,7 @@ def optimise(fully):
     """Whether XLA optimises what this process and its children compile from now on."""
     jax.config.update("jax_disable_most_optimizations", not fully)
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(not fully)
+    jax.clear_caches()  # or what is compiled already would be used as it is
 
 
 @pytest.fixture(autouse=True, scope="session")

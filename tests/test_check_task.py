@@ -216,7 +216,7 @@ class TimeStandsStill(Sound):
         return eqx.tree_at(lambda s: s.t, super().step(state, action), state.t)
 
 
-@breaks("clock", "step: the goal moves within an episode")
+@breaks("clock", "step: the scenario changes within an episode")
 class GoalMoves(Sound):
     def step(self, state, action):
         return eqx.tree_at(
@@ -232,7 +232,9 @@ class EverybodySeesEverybody(Sound):
         )
 
 
-@breaks("local", "observe: a row changes with the goal of agent 1, which it must not know")
+@breaks(
+    "local", "observe: a row changes with the goal .scenario. of agent 1, which it must not know"
+)
 class FollowersSeeTheirGoal(Sound):
     def observe(self, state, links):
         return jnp.concatenate(

@@ -387,7 +387,7 @@ DAMAGE = {
     "cut": lambda d: os.truncate(d / store.PAYLOAD, 100),
     "emptied": lambda d: os.truncate(d / store.MANIFEST, 0),
     "file gone": lambda d: (d / store.PAYLOAD).unlink(),
-    "alien file": lambda d: (d / "extra").write_text("x"),
+    "foreign file": lambda d: (d / "extra").write_text("x"),
     "link": lambda d: (
         (d / store.PAYLOAD).rename(d.parent / "away"),
         (d / store.PAYLOAD).symlink_to(d.parent / "away"),

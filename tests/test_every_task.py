@@ -31,8 +31,22 @@ VARIANTS = {
 }
 GAMES = VARIANTS | {f"TASKS[{k}]": g for k, g in TASKS.items() if g not in VARIANTS.values()}
 PLANAR = {k: g for k, g in GAMES.items() if isinstance(g, AbstractPlanar)}
-every_game = pytest.mark.parametrize("game", GAMES.values(), ids=GAMES)
-every_planar_game = pytest.mark.parametrize("game", PLANAR.values(), ids=PLANAR)
+
+
+def each(games):
+    """As parameters; what differs little from another one is slow."""
+    slow = {"ring", "edges", "rk4", "TASKS[rendezvous-path5]", "TASKS[rendezvous-late]"}
+    slow |= {"TASKS[ring]"}  # many steps in an episode
+    seen: set[str] = set()
+    for name, game in games.items():
+        alike = name.startswith("TASKS") and type(game).__name__ in seen
+        marks = [pytest.mark.slow] if name in slow or alike else []
+        seen |= {type(game).__name__} if name.startswith("TASKS") else set()
+        yield pytest.param(game, id=name, marks=marks)
+
+
+every_game = pytest.mark.parametrize("game", list(each(GAMES)))
+every_planar_game = pytest.mark.parametrize("game", list(each(PLANAR)))
 
 
 @eqx.filter_jit

@@ -1,4 +1,4 @@
-"""Every experiment in its quick form: tables that are gone on with, figures from them alone."""
+"""Every experiment in its quick form: tables that are resumed, figures from them alone."""
 
 import argparse
 import csv

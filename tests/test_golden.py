@@ -6,6 +6,7 @@ and actions beyond the limits, which have to clip.
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,8 @@ import numpy as np
 import pytest
 
 from marlyap.games.game import AbstractRegulation
-from marlyap.games.planar import Goals
+from marlyap.games.planar import AbstractPlanar, Goals
+from marlyap.games.quadrotors import Flight
 from marlyap.tasks import TASKS
 from marlyap.tasks.cartpoles import Row
 from marlyap.tasks.consensus import Hearing
@@ -25,6 +27,8 @@ from marlyap.tasks.flock import Wind
 from marlyap.tasks.frequency import Disturbance
 from marlyap.tasks.microgrid import Loads
 from marlyap.tasks.networks import new_england
+from marlyap.tasks.platoon import Road
+from marlyap.tasks.ring import Traffic
 from marlyap.tasks.voltage import Injections
 from marlyap.types import State
 
@@ -34,10 +38,17 @@ class Case(NamedTuple):
 
     task: str
     parts: Callable[..., tuple[Any, ...]]  # x, scenario and memory, if any, of a state in the file
+    errors: Callable[[Any], Any] = lambda e: e  # those of the game, ordered as in the file
 
 
 def planar(start):
     return start["x"], Goals(start["goal"])
+
+
+def points(start):
+    x = jnp.concatenate([start["p"], start["v"]], axis=-1)
+    places = jnp.asarray(TASKS["formation-di"].places, x.dtype)
+    return x, Goals(start["centre"][None] + places)
 
 
 def cartpoles(start):
@@ -51,6 +62,20 @@ def microgrid(start):
     one = jnp.ones_like(power)
     changes = jnp.zeros((), x.dtype)
     return x, Loads(power=power, change=0 * one, changes=changes, line=one, capacitance=one)
+
+
+def platoon(start):
+    h, lead = start["h"], start["v_start"]
+    road = Road(start=lead, swing=0 * lead, gain=jnp.ones_like(h), lag=0 * h)
+    return jnp.stack([h, start["v"], start["u"]], axis=-1), road
+
+
+def quads(task):
+    def parts(start):
+        goal = start["goal"][None] + jnp.asarray(TASKS[task].places, start["goal"].dtype)
+        return start["x"], Flight(goal=goal, gust=0 * goal, begins=0 * goal[0, 0])
+
+    return parts
 
 
 SEED = jnp.zeros(2, jnp.uint32)  # of noise that is not there
@@ -71,6 +96,22 @@ def frequency(start):
     x = jnp.stack([start["delta"], start["w"]], axis=-1)
     each, lines = jnp.ones(10, x.dtype), jnp.ones((10, 10), x.dtype)
     return x, Disturbance(load, 0 * one, rest, inertia=each, damping=each, lines=lines)
+
+
+def ring(task):
+    def parts(start):
+        game, length = replace(TASKS[task], noise=0.0), start["L"]
+        order, n = game.plant.order(game.agents), game.plant.cars
+        # Laps are counted here, and not in the file: every car is behind the first.
+        line = start["x"][0] - jnp.cumsum(
+            jnp.mod(-jnp.diff(start["x"], prepend=start["x"][:1]), length)
+        )
+        flow = game.plant.flow(length / n - game.plant.size)
+        seed = jax.random.key_data(jax.random.key(0))
+        x = jnp.stack([line, start["v"]], axis=-1)[order]
+        return x, Traffic(length=length, flow=flow, noise=0 * length, seed=seed)
+
+    return parts
 
 
 def voltage(*inverters):
@@ -102,12 +143,21 @@ def gnn_flock(start):
 CASES = {
     "rendezvous-unicycle": Case("rendezvous", planar),
     "formation-unicycle": Case("formation", planar),
+    "formation-di": Case("formation-di", points),
     "cartpoles": Case("cartpoles", cartpoles),
     "microgrid": Case("microgrid", microgrid),
+    "platoon-catchup": Case("platoon-catchup", platoon),
+    "platoon-slowdown": Case("platoon-slowdown", platoon),
+    "quads-planar": Case(
+        "quads-planar", quads("quads-planar"), lambda e: e[:, np.array([0, 1, 4, 2, 3, 5])]
+    ),
+    "quads-space": Case("quads-space", quads("quads-space")),
     "consensus": Case("consensus", consensus),
     "consensus-unstable": Case("consensus-unstable", consensus),
     "estimation": Case("estimation", estimation),
     "frequency": Case("frequency", frequency),
+    "ring": Case("ring", ring("ring"), lambda e: e.reshape(-1, 2)),
+    "ring2": Case("ring2", ring("ring2"), lambda e: e.reshape(-1, 2)),
     "coverage": Case("coverage", coverage),
     "coverage-bump": Case("coverage-bump", coverage),
     "flock": Case("flock", flock),
@@ -150,14 +200,14 @@ def compared(name, kind, close):
     case = CASES[name]
     for told, seen in zip(loaded(name)["trajectories"], played(name, kind), strict=True):
         x, costs, failed, success, errors = seen
-        states = [np.asarray(case.parts(array(s, np.float64))[0]) for s in told["next_states"]]
+        states = [np.asarray(case.parts(array(s, kind))[0]) for s in told["next_states"]]
         agree(x, np.array(states), close)
         agree(costs, np.array(told["costs"]), close)
         assert np.array_equal(failed, told["failed"]), name
         assert bool(success) == told["success_at_end"], name
         want = np.array(told["errors_at_end"])
-        got = np.asarray(errors)
-        if CASES[name].task in ("rendezvous", "formation"):  # in the world's frame there
+        got = np.asarray(case.errors(errors))
+        if isinstance(TASKS[case.task], AbstractPlanar):  # in the world's frame there
             got, want = (np.linalg.norm(e[:, :2], axis=1) for e in (got, want))
         agree(got, want, close)
 

@@ -34,7 +34,7 @@ FEW = ("--episodes", "20")
 
 
 def untrained(place, seed=0, **fields):
-    """A run that has handed out the policy it began with, and logged its end."""
+    """A run that deploys the policy it began with, and logged its end."""
     rule = MASAC(constraint=Lyapunov(**fields), **SMALL)
     plan = Schedule(steps=16, environments=2, capacity=40, warmup=8)
     names = {"task": "own/path/to/tasks.py:Meet", "algorithm": "masac-lyapunov", "preset": "tuned"}

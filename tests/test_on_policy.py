@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import same
+from conftest import close
 from jaxtyping import Array
 from test_docs import blocks
 from test_toy_games import CONSTANT, REACH, Toy
@@ -138,7 +138,7 @@ def test_the_algorithm_of_the_page_learns(ActorCritic):
 
 @pytest.mark.parametrize("name", ["off-policy", "on-policy"])
 def test_episodes_may_be_handed_in(name, ActorCritic):
-    """What a host needs: explore, play elsewhere, learn. It is the iteration, to the last bit."""
+    """What a host needs: explore, play elsewhere, learn. It is the iteration, up to rounding."""
     small = dict(batch=8, gamma=0.9)
     algorithm = (
         MASAC(**small, actor_width=4, critic_width=4)
@@ -166,4 +166,5 @@ def test_episodes_may_be_handed_in(name, ActorCritic):
 
     whole, info = iterate(carry.learner)
     apart, log, _ = learn(carry.learner, host(carry.learner))
-    assert same(whole, apart) and set(log) == {*info.log} - {"return"}
+    close(whole, apart, rtol=1e-5, atol=1e-6)
+    assert set(log) == {*info.log} - {"return"}

@@ -511,7 +511,7 @@ def test_adam_is_adam():
 
 
 def test_policies_of_a_learner(masac, learner, batch):
-    """What explores is pi; what is handed out is its running mean, without noise."""
+    """What explores is pi; what is deployed is its running mean, without noise."""
     explorer, policy = masac.explore(learner), masac.policy(learner)
     assert isinstance(explorer, Sampled) and isinstance(policy, Greedy)
     run = eqx.filter_jit(lambda p, obs, key: p(obs, key))

@@ -165,8 +165,8 @@ def test_a_damaged_program_is_made_anew(part, folder):
     content = bytearray((place / part).read_bytes())
     content[len(content) // 2] ^= 1
     (place / part).write_bytes(content)
-    mended, _ = compiled()(start())
-    assert len(TRACES) == 2 and same(sound, mended)
+    fixed, _ = compiled()(start())
+    assert len(TRACES) == 2 and same(sound, fixed)
     compiled()
     assert (
         len(TRACES) == 2 and json.loads((place / MANIFEST).read_text())["kind"] == export_cache.KIND

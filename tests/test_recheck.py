@@ -794,7 +794,7 @@ def test_it_names_what_it_does_not_know():
 @pytest.fixture(scope="module")
 def without_a_model(tmp_path_factory):
     """A certificate about a game that recheck has no model of."""
-    game, path = CartPoles(agents=2, horizon=20), tmp_path_factory.mktemp("other") / "c"
+    game, path = CartPoles(agents=2, horizon=250), tmp_path_factory.mktemp("other") / "c"
     table = {"reach": Reach(rollouts=500, share=0.9), "quantiles": Quantiles(rollouts=500, q=0.9)}
     result = certify(game, CartFeedback(game), table, seed=1, confidence=0.99)
     save(path, result, game, CartFeedback(game))

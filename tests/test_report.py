@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
 
 from marlyap.errors import UserError
 from marlyap.report import charts, scene
@@ -32,6 +33,7 @@ from marlyap.report.data import (
 )
 from marlyap.report.gif import film_gif, film_pair_gif
 from marlyap.report.page import html
+from marlyap.report.plot import moment
 from marlyap.report.png import learning_curves_png, trajectories_png
 from marlyap.report.words import DASH
 
@@ -595,6 +597,20 @@ def test_a_road_has_a_lane_for_each_body():
     assert np.array_equal(places[0, :, 1], [0, -1, -2, -3]) and np.ptp(places[..., 1], 0).max() == 0
     assert np.allclose(places[..., :1], on_a_road().frames.positions, atol=1e-4)
     assert [s["name"] for s in made["strips"]] == ["largest distance (m)", "speed (m/s)"]
+
+
+def test_a_rod_joins_two_bodies_of_one_colour(tmp_path):
+    film = rollout(1, agents=4, rods=((0, 2), (1, 3)))
+    (made,) = played(film)
+    assert made["tints"] == [0, 1, 0, 1] and made["rods"] == [[0, 2], [1, 3]]
+    assert played(rollout(1))[0]["tints"] == [0, 1, 2]
+    (drawn,) = scene.scenes([film])
+    (rods,) = [a for a in moment(drawn, drawn.panels[0], 3, trail=False)
+               if isinstance(a, LineCollection) and a.get_linewidths()[0] > 2]  # fmt: skip
+    ends = [[drawn.places[3, i], drawn.places[3, j]] for i, j in film.frames.rods]
+    np.testing.assert_allclose(rods.get_segments(), ends)
+    film_gif(film, tmp_path / "f.gif")
+    assert (tmp_path / "f.gif").read_bytes()[:3] == b"GIF"
 
 
 def test_space_is_seen_from_above_and_from_the_side_at_one_scale():

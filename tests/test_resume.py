@@ -76,7 +76,7 @@ def until(iterations):
 
 
 def fit(*args, **kwargs):
-    """What `fit` tells, of a Progress its line of the log; checkpoints are looked at on disk."""
+    """What `fit` tells, of a Progress its line of the log; checkpoints are read from disk."""
     for event in fit_runs(*args, **kwargs):
         if not isinstance(event, events.Saved):
             yield event.line if isinstance(event, events.Progress) else event
@@ -122,7 +122,7 @@ def eager(monkeypatch):
     monkeypatch.setattr(FIT, "SHARE", 1e9)
 
 
-# --- Stopped and gone on with --------------------------------------------------------------------
+# --- Stopped and resumed -------------------------------------------------------------------------
 
 
 CUTS = {
@@ -376,7 +376,7 @@ def test_a_diverged_seed_does_not_touch_its_neighbour(uninterrupted, tmp_path, m
     assert final(runs[0]) == uninterrupted("masac", PAIR)[0]
     assert contents(runs[1].directory) == before and not runs[1].finished
 
-    monkeypatch.undo()  # what was saved is sound, so the fallen seed can be gone on with
+    monkeypatch.undo()  # what was saved is sound, so the fallen seed can be resumed
     list(fit([Run.open(runs[1].directory)]))
     assert runs[1].checkpoints.latest().step == 6
 

@@ -604,19 +604,19 @@ def test_the_last_two_remain_and_the_last_is_loaded(tmp_path):
 
 def test_steps_are_numbers_not_names(tmp_path):
     checkpoints = fill(tmp_path / "c", 999_999_999, 1_000_000_000)
-    for alien in ("step-1", "step-00000000x", "notes", "damaged-step-000000009-aa"):
-        (tmp_path / "c" / alien).mkdir()
+    for foreign in ("step-1", "step-00000000x", "notes", "damaged-step-000000009-aa"):
+        (tmp_path / "c" / foreign).mkdir()
     assert checkpoints.steps() == [999_999_999, 1_000_000_000]
     assert checkpoints.latest().step == 1_000_000_000
 
 
-@pytest.mark.parametrize("fault", ["flip", "missing", "empty", "alien", "newer"])
+@pytest.mark.parametrize("fault", ["flip", "missing", "empty", "foreign", "newer"])
 def test_a_bad_newest_falls_back_with_a_warning(tmp_path, fault):
     checkpoints = fill(tmp_path, 1, 2)
     newest = checkpoints.path(2)
     if fault == "flip":
         damage(newest)
-    elif fault == "alien":
+    elif fault == "foreign":
         (newest / "core").write_text("x")
     elif fault == "newer":
         forge(newest, lambda manifest: manifest.update(schema=2))
@@ -683,8 +683,8 @@ def scratch_names() -> tuple[list[str], list[str]]:
     stale += [f".step-000000007.{mine}-00000000-00000000.tmp"]  # our number, another process
     alive = [f".step-000000007.{mine}-{store.SESSION}-00000000.tmp"]
     alive += [f".step-000000007.{other}-00000000-00000000.tmp"]
-    alien = [".step-000000007.tmp", "step-000000007.tmp", ".x.1-2-3.tmp", ".git"]
-    return stale, alive + alien
+    foreign = [".step-000000007.tmp", "step-000000007.tmp", ".x.1-2-3.tmp", ".git"]
+    return stale, alive + foreign
 
 
 def test_what_the_dead_left_goes_and_what_the_living_hold_stays(tmp_path):

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from marlyap.cli import (
+    bench,
     certify,
     check_task,
     demo,
@@ -51,6 +52,7 @@ VERBS: dict[str, Verb] = {
     "demo": demo,
     "train": train,
     "evaluate": evaluate,
+    "bench": bench,
     "certify": certify,
     "recheck": recheck,
     "check-task": check_task,
@@ -105,6 +107,3 @@ def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, dict[str, str]]:
             raise UserError(f"{name}: it is given twice.")
         overrides[name[2:]] = value
     return parser().parse_args(plain), overrides
-
-
-PARTS = ("task", "algorithm", "schedule")

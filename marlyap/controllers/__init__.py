@@ -17,17 +17,34 @@ from marlyap.controllers.flocking import (
     FreeFlock as FreeFlock,
     OlfatiSaber as OlfatiSaber,
 )
+from marlyap.controllers.formation_feedback import (
+    FormationConsensus as FormationConsensus,
+    FormationFeedback as FormationFeedback,
+)
 from marlyap.controllers.gradient import GradientConsensus as GradientConsensus
 from marlyap.controllers.grid_feedback import GridFeedback as GridFeedback
 from marlyap.controllers.lin_francis_maggiore import LinFrancisMaggiore as LinFrancisMaggiore
 from marlyap.controllers.lloyd import Lloyd as Lloyd
 from marlyap.controllers.optimal import OptimalControl as OptimalControl, Replayed as Replayed
+from marlyap.controllers.platoon_feedback import (
+    PlatoonLinear as PlatoonLinear,
+    PlatoonOVM as PlatoonOVM,
+)
 from marlyap.controllers.point_offset import PointOffset as PointOffset
 from marlyap.controllers.pursuit import TreePursuit as TreePursuit
+from marlyap.controllers.quad_chain import (
+    QuadChain as QuadChain,
+    QuadChainSpace as QuadChainSpace,
+)
 from marlyap.controllers.reference import (
     Hold as Hold,
     UniformlyRandom as UniformlyRandom,
     Zero as Zero,
+)
+from marlyap.controllers.ring_feedback import (
+    FollowerStopper as FollowerStopper,
+    RingHuman as RingHuman,
+    RingLinear as RingLinear,
 )
 from marlyap.controllers.voltage_droop import (
     DeadBand as DeadBand,
@@ -42,13 +59,22 @@ CONTROLLERS: dict[str, type[AbstractController]] = {
     "lin-francis-maggiore": LinFrancisMaggiore,
     "tree-pursuit": TreePursuit,
     "optimal-control": OptimalControl,
+    "formation-consensus": FormationConsensus,
+    "formation-linear": FormationFeedback,
     "cart-lqr": CartLQR,
     "cart-feedback": CartFeedback,
     "grid-feedback": GridFeedback,
+    "platoon-ovm": PlatoonOVM,
+    "platoon-linear": PlatoonLinear,
+    "quad-chain": QuadChain,
+    "quad-chain-space": QuadChainSpace,
     "laplacian": Laplacian,
     "consensus-filter": ConsensusFilter,
     "droop": Droop,
     "steep-droop": SteepDroop,
+    "follower-stopper": FollowerStopper,
+    "ring-linear": RingLinear,
+    "ring-human": RingHuman,
     "dead-band": DeadBand,
     "dead-band-mild": MildDeadBand,
     "linear-voltage": LinearVoltage,

@@ -6,6 +6,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from marlyap.errors import UserError
@@ -71,6 +72,15 @@ def mean_pull(
     weight = jnp.sum(linked, axis=1) + b
     pull = jnp.sum(gaps, axis=1) + b[:, None] * (game.goals(state) - q)
     return pull / jnp.where(weight > 0, weight, 1.0)[:, None]
+
+
+def needs_a_chain(game: AbstractGame, agents: int | None = None) -> None:
+    """Raise UserError unless agent 0 leads, and every other one sees the one before it."""
+    i = np.arange(1, game.agents)
+    if not game.leads[0] or not game.adjacency[i, i - 1].all():
+        raise UserError("controller: it needs agent 0 as a leader and graph path or complete.")
+    if agents is not None and agents != game.agents:
+        raise UserError(f"controller: it has gains for {agents} agents, not for {game.agents}.")
 
 
 def as_action(game: AbstractGame, u: Float[Array, "agent du"]) -> Action:

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 from marlyap.controllers.controller import AbstractController, as_action
 from marlyap.errors import UserError
 from marlyap.tasks.frequency import Frequency, SwingEquations
-from marlyap.tasks.networks import new_england
 
 
 class Droop(AbstractController):
@@ -29,12 +28,9 @@ class Droop(AbstractController):
         25.922562,
     )  # k (p.u./Hz)
 
-    def __check_init__(self):
-        machines = len(new_england().angle)
-        if len(self.gains) != machines:
-            raise UserError(f"gains: give one for each machine, {machines} numbers.")
-
     def __call__(self, state, key):
+        if len(self.gains) != self.game.agents:
+            raise UserError(f"gains: give one for each machine, {self.game.agents} numbers.")
         k = jnp.asarray(self.gains) / jnp.asarray(self.game.plant.largest)
         return as_action(self.game, (k * state.x[:, 1])[:, None])
 

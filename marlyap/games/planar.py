@@ -34,15 +34,9 @@ class AbstractPlanar(AbstractRegulation):
 
     def __check_init__(self):
         whole_fields(self)
-        n = self.agents
         if not 0 < self.radius < 1e6:
             raise UserError(f"radius: {self.radius} m must be a positive distance in metres.")
-        if len(set(self.leaders)) != len(self.leaders):
-            raise UserError(f"leaders: {self.leaders} names an agent twice.")
-        if not self.leaders or not all(0 <= i < max(n, 1) for i in self.leaders):
-            raise UserError(
-                f"leaders: {self.leaders} must name at least one agent, each from 0 to {n - 1}."
-            )
+        check_leaders(self.leaders, self.agents)
 
     @property
     def plant(self) -> Independent:
@@ -156,6 +150,16 @@ class AbstractPlanar(AbstractRegulation):
     def local_entries(self, headings: bool = False) -> tuple[Entry, ...]:
         """What the entries of `local_view` are: for `observation_entries`."""
         return body_frame_entries(self.dynamics, self.slots.shape[1], headings)
+
+
+def check_leaders(leaders: tuple[int, ...], agents: int) -> None:
+    """Raise UserError unless leaders are named, each once and each an agent."""
+    if len(set(leaders)) != len(leaders):
+        raise UserError(f"leaders: {leaders} names an agent twice.")
+    if not leaders or not all(0 <= i < max(agents, 1) for i in leaders):
+        raise UserError(
+            f"leaders: {leaders} must name at least one agent, each from 0 to {agents - 1}."
+        )
 
 
 WAYS = ("ahead", "left")

@@ -32,7 +32,7 @@ def length(v: Float[Array, "*n d"]) -> Float[Array, "*n"]:
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
 
 
-def near(v: Float[Array, "*n 2"], scale: float) -> Float[Array, "*n 2"]:
+def near(v: Float[Array, "*n d"], scale: float) -> Float[Array, "*n d"]:
     """v / (|v| + scale): the direction far away, and close by a magnified v.
 
     A network fed with metres alone cannot tell centimetres apart.

@@ -27,7 +27,7 @@ class Health(NamedTuple):
 
     @classmethod
     def sound(cls) -> "Health":
-        """Nothing is wrong, or nothing was looked at."""
+        """Nothing is wrong, or nothing was checked."""
         return cls(*[jnp.asarray(-1)] * 6, networks=jnp.asarray(0))
 
     @classmethod

@@ -105,6 +105,7 @@ class Frames:
     signals: Mapping[str, np.ndarray] = field(default_factory=dict)  # "name (unit)": [time agent]
     leaders: tuple[bool, ...] = ()  # of each agent
     links: tuple[Pairs, ...] = ()  # one entry where they never change, else [time]
+    rods: Pairs = ()  # bodies that are joined; the second has the colour of the first
     edge: Number = None  # how near is near enough, drawn around each goal
     unit: str = ""  # of positions and edge
 

@@ -44,19 +44,34 @@ def one(
 
     Raises UserError if the episode is not among the evaluation's.
     """
-    if not 0 <= index < episodes:
-        raise UserError(
-            f"episode: {index} is out of range; the evaluation has 0 to {episodes - 1}."
-        )
     there = run.game if game is None else game
     _, L = run.deployed()
-    keys = jax.random.split(stream(seed, "evaluate"), episodes)
     controller = run.controller(game)
-    path = _episode(there, controller, keys[index])
+    path = _episode(there, controller, _start(index, seed, episodes))
     fits = L is not None and groups.same_game(there, run.game)  # L is of the trained game's states
     values = _lyapunov(there, controller, L, path)[:-1] if fits else None
     said = {"label": label or f"start {index}", "start": str(index), "run": whose}
     return film(there, path, values, "L", **said)
+
+
+def driven(
+    game: AbstractGame, controller: Controller, index: int, seed: int, episodes: int = 500
+) -> Film:
+    """One evaluation episode of a hand-written controller as a film.
+
+    Raises UserError if the episode is not among the evaluation's.
+    """
+    path = _episode(game, controller, _start(index, seed, episodes))
+    return film(game, path, label=f"start {index}", start=str(index))
+
+
+def _start(index: int, seed: int, episodes: int) -> Key:
+    """The key of an evaluation's start. Raises UserError if there is none of this number."""
+    if not 0 <= index < episodes:
+        raise UserError(
+            f"episode: {index} is out of range; the evaluation has 0 to {episodes - 1}."
+        )
+    return jax.random.split(stream(seed, "evaluate"), episodes)[index]
 
 
 def worst_case(
@@ -101,6 +116,7 @@ def film(
         if flat
         else {k: np.asarray(v) for k, v in jax.vmap(game.signals)(state).items()},
         leaders=tuple(bool(x) and not game.leads.all() for x in game.leads),
+        rods=() if scene is None else scene.rods,
         links=links[:1] if all(now == links[0] for now in links) else links,
         edge=game.edge if game.unit == METRES else None,
         unit=METRES,

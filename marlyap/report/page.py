@@ -13,7 +13,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from marlyap.report import charts, plot, words
@@ -29,10 +29,10 @@ def html(page: Page) -> str:
     """The whole report as the text of one HTML file."""
     shown, script = scenes(page.films), _own("player.js")
     radii = sorted({radius for run in page.runs for radius, *_ in charts.within(run)})
-    return _template().render(
+    return page_of(
+        "page.html",
         page=page,
         policy=_policy(script),
-        style=_own("style.css"),
         script=script,
         scenes=shown,
         films=_json([played(scene) for scene in shown]),
@@ -48,8 +48,13 @@ def html(page: Page) -> str:
     )
 
 
+def page_of(template: str, **said: Any) -> str:
+    """A page of this package, in its style."""
+    return _templates().get_template(template).render(style=_own("style.css"), **said)
+
+
 @cache
-def _template() -> Template:
+def _templates() -> Environment:
     made = Environment(
         loader=PackageLoader("marlyap", "report"),
         autoescape=True,
@@ -68,7 +73,7 @@ def _template() -> Template:
         "facts": _facts,
     }
     made.tests["known"] = lambda value: words.number(value) is not None
-    return made.get_template("page.html")
+    return made
 
 
 def _own(name: str) -> Markup:

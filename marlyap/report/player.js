@@ -26,6 +26,7 @@
     }
   }
   const colourOf = (agent) => colours["c" + (agent % 6)];
+  const bodyColour = (body) => colourOf(film.tints[body]);
 
   function prepare(canvas) { // sharp on every screen; returns the context and the size in CSS pixels
     const ratio = devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
@@ -95,8 +96,9 @@
       spots.push(spot && place(spot));
     }
     drawEdges(pen, spots);
+    for (const [i, j] of film.rods) if (spots[i] && spots[j]) drawRod(pen, spots[i], spots[j], bodyColour(i));
     for (let i = 0; i < agents; i++) drawTrail(pen, place, i, spots[i]);
-    for (let i = 0; i < agents; i++) if (spots[i]) drawAgent(pen, spots[i], b === 1 ? heading(i, frame) : null, size, colourOf(i), film.leaders[i]);
+    for (let i = 0; i < agents; i++) if (spots[i]) drawAgent(pen, spots[i], b === 1 ? heading(i, frame) : null, size, bodyColour(i), film.leaders[i]);
   }
 
   function drawLine(pen, colour, a, b, c, d) {
@@ -141,9 +143,14 @@
     pen.globalAlpha = 1;
   }
 
+  function drawRod(pen, a, b, colour) {
+    pen.strokeStyle = colour; pen.lineWidth = 4;
+    pen.beginPath(); pen.moveTo(...a); pen.lineTo(...b); pen.stroke();
+  }
+
   function drawTrail(pen, place, agent, spot) { // the whole path faintly, the last moments strongly
     const path = film.positions.map((row) => known(row[agent]) ? place(row[agent]) : null);
-    pen.strokeStyle = colourOf(agent);
+    pen.strokeStyle = bodyColour(agent);
     const segment = (a, b, alpha, width) => {
       if (!a || !b) return;
       pen.globalAlpha = alpha; pen.lineWidth = width;

@@ -113,7 +113,7 @@ def ground(axes: Axes, scene: Scene, panel: Panel) -> None:
 def path(axes: Axes, scene: Scene, panel: Panel) -> None:
     """The way of each body from its start, a small circle, with a dot every second."""
     for k in range(scene.places.shape[1]):
-        way, colour = scene.places[:, k][:, panel.axes], ink(k)
+        way, colour = scene.places[:, k][:, panel.axes], scene.body_ink(k)
         axes.plot(*way.T, color=colour, linewidth=1.4, solid_capstyle="round")
         axes.plot(*way[scene.every_second].T, ".", color=colour, markersize=3.5)
         known = way[np.isfinite(way).all(1)][:1]
@@ -128,6 +128,9 @@ def moment(scene: Scene, panel: Panel, k: int, trail: bool, size: int = 9) -> It
     yield LineCollection(segments, colors=SOFT, linewidths=0.7, alpha=0.6)
     if trail:
         yield from (_trail(scene, panel, body, k) for body in range(len(spots)))
+    rods = scene.film.frames.rods
+    inks = [scene.body_ink(body) for body, _ in rods]
+    yield LineCollection([spots[[*rod]] for rod in rods], colors=inks, linewidths=2.4)
     for body, spot in enumerate(spots):
         if np.isfinite(spot).all():
             yield from _body(scene, panel, body, k, spot, size)
@@ -152,7 +155,7 @@ def _trail(scene: Scene, panel: Panel, body: int, k: int) -> Artist:
     """The whole way so far, fading into a thin line."""
     way = scene.places[: k + 1, body][:, panel.axes]
     fresh = np.clip(1 - (scene.times[k] - scene.times[1 : k + 1]) / TRAIL, 0, 1)
-    colours = np.tile(to_rgba(ink(body)), (len(fresh), 1))
+    colours = np.tile(to_rgba(scene.body_ink(body)), (len(fresh), 1))
     colours[:, 3] = 0.3 + 0.7 * fresh
     pieces = np.stack([way[:-1], way[1:]], axis=1)
     return LineCollection(list(pieces), colors=colours, linewidths=1 + 1.6 * fresh)
@@ -162,7 +165,7 @@ def _body(
     scene: Scene, panel: Panel, body: int, k: int, spot: np.ndarray, size: int
 ) -> Iterator[Artist]:
     """An arrow where the heading is known and seen, else a disc; a leader is filled and ringed."""
-    leads, colour = scene.leaders[body], ink(body)
+    leads, colour = scene.leaders[body], scene.body_ink(body)
     x, y = [spot[0]], [spot[1]]
     seen = scene.angles is not None and panel.axes == (0, 1)
     angle = float(scene.angles[k, body]) if seen else np.nan  # pyright: ignore[reportOptionalSubscript]

@@ -121,6 +121,15 @@ class Scene:
         """Whether each agent has a goal of its own."""
         return self.goals.shape[1] > 1
 
+    @property
+    def tints(self) -> list[int]:
+        """The number of each body's colour."""
+        joined = {b: a for a, b in self.film.frames.rods}
+        return [joined.get(body, body) for body in range(self.places.shape[1])]
+
+    def body_ink(self, body: int) -> str:
+        return ink(self.tints[body])
+
     def goal_ink(self, number: int) -> str:
         return ink(number) if self.own_goals else INK
 
@@ -277,6 +286,8 @@ def played(scene: Scene) -> dict[str, Any]:
         "positions": plain(scene.places),
         "headings": None if scene.angles is None else plain(scene.angles, 3),
         "leaders": scene.leaders,
+        "rods": scene.film.frames.rods,
+        "tints": scene.tints,
         "edges": scene.film.frames.links or ((),),
         "panels": [vars(panel) for panel in scene.panels],
         "strips": [vars(strip) | {"lines": _rounded(strip)} for strip in scene.strips],

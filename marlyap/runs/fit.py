@@ -47,7 +47,7 @@ def fit(
 
     Several runs must differ in their seed alone; they advance together under `vmap`. Everything
     is saved at the end and when stopped, so that calling this again resumes bit for bit. A run in
-    which a number stops being finite is given up, the others go on; with more `attempts` it is
+    which a number stops being finite is stopped, the others continue; with more `attempts` it is
     taken up again, from its last checkpoint and with other random numbers.
     Raises Diverged (a UserError) if this was so in every run to the last.
     """
@@ -108,7 +108,7 @@ def _iteration(loaded: _Loaded) -> int:
 def _together(
     loaded: list[_Loaded], stop: Callable[[], bool]
 ) -> Generator[events.Event, None, dict[int, Diverged]]:
-    """Train runs that stand at the same iteration; returns why, for each seed that was given up."""
+    """Train runs that stand at the same iteration; returns why, for each seed that was stopped."""
     faults: dict[int, Diverged] = {}
     runs, trainer = [one.run for one in loaded], loaded[0].run.trainer
     first = carry = _stack([one.carry for one in loaded])

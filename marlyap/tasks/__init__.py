@@ -7,10 +7,17 @@ from marlyap.tasks.coverage import Coverage as Coverage
 from marlyap.tasks.estimation import Estimation as Estimation
 from marlyap.tasks.flock import Flock as Flock
 from marlyap.tasks.formation import Formation as Formation
+from marlyap.tasks.formation_di import DisplacementFormation as DisplacementFormation
 from marlyap.tasks.frequency import Frequency as Frequency, SwingEquations
 from marlyap.tasks.gnn_flock import GnnFlock as GnnFlock
 from marlyap.tasks.microgrid import Microgrid as Microgrid
+from marlyap.tasks.platoon import Platoon as Platoon
+from marlyap.tasks.quads import (
+    PlanarFormation as PlanarFormation,
+    SpaceFormation as SpaceFormation,
+)
 from marlyap.tasks.rendezvous import Rendezvous as Rendezvous
+from marlyap.tasks.ring import Ring as Ring
 from marlyap.tasks.voltage import PowerFlow, Voltage as Voltage
 
 
@@ -21,14 +28,22 @@ TASKS = {
     "rendezvous-late": Rendezvous(dynamics=LateUnicycle()),
     "rendezvous-rest": Rendezvous(rest_weight=0.03, horizon=60),
     "formation": Formation(),
+    "formation-di": DisplacementFormation(),
     "cartpoles": CartPoles(),
     "microgrid": Microgrid(),
+    "platoon-catchup": Platoon(),
+    "platoon-slowdown": Platoon(start_headway=(1.0, 1.0), start_speed=(1.5, 2.5)),
+    "platoon-long": Platoon(16, start_headway=(1.0, 1.0), start_speed=(1.5, 2.5)),
+    "quads-planar": PlanarFormation(),
+    "quads-space": SpaceFormation(),
     "consensus": Consensus(),
     "consensus-unstable": Consensus(plant=Averaging(growth=1.1)),
     "estimation": Estimation(),
     "frequency": Frequency(),
     "frequency-weak": Frequency(plant=SwingEquations(damping=10 * (-0.2,))),
     "frequency-step": Frequency(load_step=0.5),
+    "ring": Ring(),
+    "ring2": Ring(agents=2),
     "voltage13": Voltage(),
     "voltage33": Voltage(
         agents=6,

@@ -180,13 +180,14 @@ class CartPoles(AbstractRegulation):
             velocity=jnp.concatenate([rows(speed, still), rows(*tip_speed)]),
             goal=rows(goal, still),
             spin=jnp.concatenate([rate, rate]),  # of an agent, its pole's
+            rods=tuple((i, self.agents + i) for i in range(self.agents)),
         )
 
     def state_shapes(self, state):
         return super().state_shapes(state) | {"x": (state.x, (self.agents, 4))}
 
 
-def check_weights(weights: tuple[float, ...], errors: int) -> None:
+def check_weights(weights: tuple[float, ...], errors: int, name: str = "weights") -> None:
     """Raise UserError unless there is a weight >= 0 for each error."""
     if len(weights) != errors or not all(0 <= w < 1e6 for w in weights):
-        raise UserError(f"weights: {weights} must be {errors} numbers, each 0 or more.")
+        raise UserError(f"{name}: {weights} must be {errors} numbers, each 0 or more.")
