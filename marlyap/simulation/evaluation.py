@@ -112,14 +112,10 @@ def _in_parts(game: AbstractGame, controller: Controller, keys: Keys, beyond: in
     """The outcomes, of as many episodes at once as there is room for: whole rollouts are kept."""
     state = eqx.filter_eval_shape(game.reset, jax.random.key(0))
     numbers = sum(leaf.size for leaf in jax.tree.leaves(state)) + game.agents
-    at_once = max(1, ROOM // (numbers * (game.horizon + beyond)))
-    parts = [outcomes(game, controller, k, beyond) for k in _split(keys, at_once)]
+    n = max(1, ROOM // (numbers * (game.horizon + beyond)))
+    some = [keys[k : k + n] for k in range(0, len(keys), n)]
+    parts = [outcomes(game, controller, part, beyond) for part in some]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-
-
-def _split(keys: Keys, most: int) -> list[Keys]:
-    """The keys in parts of at most so many; all but the last have the same length."""
-    return [keys[k : k + most] for k in range(0, len(keys), most)]
 
 
 @eqx.filter_jit
