@@ -34,6 +34,7 @@ class AbstractQuads(AbstractRegulation):
     weights: eqx.AbstractVar[tuple[float, ...]]
     effort: eqx.AbstractVar[float]
     gust: eqx.AbstractVar[float]
+    inertia_spread: eqx.AbstractVar[float]
     spacing: eqx.AbstractVar[float]
     size: eqx.AbstractVar[float]
 
@@ -42,6 +43,7 @@ class AbstractQuads(AbstractRegulation):
             check_range(name, getattr(self, name), 0, 1e6, open=True)
         for name in ("effort", "gust", "spacing", "size"):
             check_range(name, getattr(self, name), 0, 1e6)
+        check_range("inertia_spread", self.inertia_spread, 0, 0.99)
         check_weights(self.weights, 4)
         check_leaders(self.leaders, self.agents)
 
@@ -66,13 +68,14 @@ class AbstractQuads(AbstractRegulation):
 
     def flight(self, key: Key) -> Flight:
         """The scenario of an episode."""
-        k_goal, k_gust, k_time = jax.random.split(key, 3)
-        d = len(self.plant.ways)
+        k_goal, k_gust, k_time, k_body = jax.random.split(key, 4)
+        n, d = self.agents, len(self.plant.ways)
         centre = jax.random.uniform(k_goal, (d,), minval=-self.size, maxval=self.size)
         return Flight(
             goal=centre[None] + jnp.asarray(self.places, jnp.float32),
-            gust=self.gust * jax.random.uniform(k_gust, (self.agents, d), minval=-1.0),
+            gust=self.gust * jax.random.uniform(k_gust, (n, d), minval=-1.0),
             begins=jax.random.uniform(k_time, ()) * self.horizon * self.dt,
+            inertia=1 + self.inertia_spread * jax.random.uniform(k_body, (n,), minval=-1.0),
         )
 
     def observe(self, state, links):
@@ -173,6 +176,7 @@ class PlanarFormation(AbstractQuads):
     weights: tuple[float, ...] = (1.0, 0.1, 0.1, 0.01)  # of squared gap, velocity, tilt and rates
     effort: float = 0.01  # weight of the squared action in the cost
     gust: float = 0.0  # largest acceleration by a gust, at a random time of an episode (m/s^2)
+    inertia_spread: float = 0.0  # inertias are drawn anew in an episode, up to this share off
     start: tuple[float, ...] = (1.0, 0.5, 0.2, 0.1, 0.1, 0.1)  # of each state, up to (m, rad, s)
     dt: float = 0.02  # s
     horizon: int = 250  # steps in an episode
@@ -207,6 +211,7 @@ class SpaceFormation(AbstractQuads):
     weights: tuple[float, ...] = (1.0, 0.1, 0.1, 0.01)  # of squared gap, velocity, tilt and rates
     effort: float = 0.01  # weight of the squared action in the cost
     gust: float = 0.0  # largest acceleration by a gust, at a random time of an episode (m/s^2)
+    inertia_spread: float = 0.0  # inertias are drawn anew in an episode, up to this share off
     start: tuple[float, ...] = (1.0, 0.1, 0.1, 0.1)  # places, velocities, quaternions, rates, up to
     dt: float = 0.02  # s
     horizon: int = 250  # steps in an episode
