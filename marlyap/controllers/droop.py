@@ -28,11 +28,9 @@ class Droop(AbstractController):
         25.922562,
     )  # k (p.u./Hz)
 
-    def __check_init__(self):
+    def __call__(self, state, key):
         if len(self.gains) != self.game.agents:
             raise UserError(f"gains: give one for each machine, {self.game.agents} numbers.")
-
-    def __call__(self, state, key):
         k = jnp.asarray(self.gains) / jnp.asarray(self.game.plant.largest)
         return as_action(self.game, (k * state.x[:, 1])[:, None])
 

@@ -17,7 +17,7 @@ from marlyap.threefry import uniform
 from marlyap.types import State
 
 
-BANK, DRAWN, TRIES = 256, 2000, 100  # starts that are kept, drawn at once, and how often
+BANK, DRAWN, TRIES = 512, 2000, 200  # starts that are kept, drawn at once, and how often
 
 
 class GnnFlock(AbstractRegulation):
@@ -121,8 +121,9 @@ def bank(agents: int, reach: float, apart: float) -> Float[np.ndarray, "start ag
         share, turn = np.moveaxis(uniform(key, DRAWN, agents, 2)[0], -1, 0)
         radius, angle = np.sqrt(share * np.sqrt(agents)), 2 * np.pi * turn
         q = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
-        gap = np.linalg.norm(q[:, None] - q[:, :, None], axis=-1) + themselves
-        fine = (gap.min(axis=(1, 2)) > apart) & ((gap < reach).sum(axis=2).min(axis=1) >= 2)
+        gap = np.sum((q[:, None] - q[:, :, None]) ** 2, axis=-1) + themselves
+        near = (gap < reach**2).sum(axis=2)
+        fine = (gap.min(axis=(1, 2)) > apart**2) & (near.min(axis=1) >= 2)
         kept += list(q[fine])
         if len(kept) >= BANK:
             return np.array(kept[:BANK], np.float32)
