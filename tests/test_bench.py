@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from marlyap.cli import main
-from marlyap.controllers import CONTROLLERS
+from marlyap.controllers import CONTROLLERS, AbstractController
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractRegulation
 from marlyap.runs import bench
@@ -126,15 +126,14 @@ class Counted:
 GLOBAL = ("uniform", "braking")  # not made of what each agent knows
 LOCAL = sorted({(m.task, m.controller) for m in MEASURED if m.controller not in GLOBAL})
 SILENT = ("zero", "hold", "dead-band", "dead-band-mild")  # near the target
-LONG = ("platoon-long", "ring", "ring2")  # many steps in an episode
-SLOW = (*LONG, "formation-di", "platoon-catchup", "quads-space")  # or like another one
+FAST = ("cartpoles", "consensus", "microgrid", "platoon-slowdown", "voltage13")  # one of each kind
 
 
-def marked(cases, task, slow=LONG):
-    """Those of tasks that take long are slow."""
-    name = lambda case: "-".join(str(part) for part in (case if type(case) is tuple else case[:2]))
-    slowly = lambda case: [pytest.mark.slow] if task(case) in slow else []
-    return [pytest.param(case, marks=slowly(case), id=name(case)) for case in cases]
+def marked(cases, task=lambda case: case[0], fast=FAST):
+    """Those of other tasks are slow, all in all."""
+    name = lambda case: "-".join(case[:2]) if isinstance(case, tuple) else case
+    marks = lambda case: [] if task(case) in fast else [pytest.mark.slow]
+    return [pytest.param(case, marks=marks(case), id=name(case)) for case in cases]
 
 
 def regulation(task):
@@ -143,7 +142,7 @@ def regulation(task):
     return game
 
 
-@pytest.mark.parametrize("known", marked(MEASURED, lambda m: m.task))
+@pytest.mark.parametrize("known", marked(MEASURED))
 def test_a_controller_reaches_what_was_measured(known):
     game, n = TASKS[known.task], known.episodes
     found = evaluate(game, CONTROLLERS[known.controller](game), n, beyond=0).summary()
@@ -153,9 +152,10 @@ def test_a_controller_reaches_what_was_measured(known):
     assert found["failed"]["success_rate"] == about(known.failed)
 
 
-@pytest.mark.parametrize(("task", "controller"), LOCAL)
-def test_a_controller_is_local_bounded_and_finite(task, controller):
+@pytest.mark.parametrize("case", marked(LOCAL))
+def test_a_controller_is_local_bounded_and_finite(case):
     """Row i changes with agent j only if they are linked, and even far away it is an action."""
+    task, controller = case
     game = regulation(task)
     law = CONTROLLERS[controller](game)
     act = eqx.filter_jit(lambda states: jax.vmap(lambda s: law(s, KEY))(states))
@@ -271,12 +271,7 @@ def game_has_a_map(task):
     return game.scene(game.reset(KEY)) is not None
 
 
-FAST = ("microgrid",)  # without a map, and with a holding action
-
-
-@pytest.mark.parametrize(
-    "task", [t if t in FAST else pytest.param(t, marks=pytest.mark.slow) for t in BENCH]
-)
+@pytest.mark.parametrize("task", marked(BENCH, lambda task: task, ("microgrid",)))
 def test_every_command_takes_it(task, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")  # so that no name is broken
@@ -313,9 +308,9 @@ def test_a_controller_of_another_game_is_refused(task, controller):
     elsewhere = eqx.tree_at(lambda c: c.game, law, Rendezvous())
     if law.drives:
         with pytest.raises(UserError, match=f"^controller: {type(law).__name__} drives .* not Uni"):
-            elsewhere.__check_init__()
+            AbstractController.__check_init__(elsewhere)
     else:
-        elsewhere.__check_init__()
+        AbstractController.__check_init__(elsewhere)
 
 
 def test_the_bench_measures_each_cell_once(tmp_path, monkeypatch, capsys):

@@ -33,20 +33,18 @@ GAMES = VARIANTS | {f"TASKS[{k}]": g for k, g in TASKS.items() if g not in VARIA
 PLANAR = {k: g for k, g in GAMES.items() if isinstance(g, AbstractPlanar)}
 
 
+FAST = {"complete", "path", "disk", "late", "alone"}
+FAST |= {f"TASKS[{name}]" for name in ("formation", "microgrid", "platoon-catchup", "voltage13")}
+
+
 def each(games):
-    """As parameters; what differs little from another one is slow."""
-    slow = {"ring", "edges", "rk4", "TASKS[rendezvous-path5]", "TASKS[rendezvous-late]"}
-    slow |= {"TASKS[ring]"}  # many steps in an episode
-    seen: set[str] = set()
-    for name, game in games.items():
-        alike = name.startswith("TASKS") and type(game).__name__ in seen
-        marks = [pytest.mark.slow] if name in slow or alike else []
-        seen |= {type(game).__name__} if name.startswith("TASKS") else set()
-        yield pytest.param(game, id=name, marks=marks)
+    """As parameters; those that differ little in kind from a fast one are slow."""
+    marks = lambda name: [] if name in FAST else [pytest.mark.slow]
+    return [pytest.param(game, id=name, marks=marks(name)) for name, game in games.items()]
 
 
-every_game = pytest.mark.parametrize("game", list(each(GAMES)))
-every_planar_game = pytest.mark.parametrize("game", list(each(PLANAR)))
+every_game = pytest.mark.parametrize("game", each(GAMES))
+every_planar_game = pytest.mark.parametrize("game", each(PLANAR))
 
 
 @eqx.filter_jit

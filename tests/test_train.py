@@ -11,6 +11,7 @@ import pytest
 from conftest import same
 from jaxtyping import Array
 
+from marlyap.controllers import CONTROLLERS
 from marlyap.errors import UserError
 from marlyap.games.dynamics import SingleIntegrator
 from marlyap.learning.schedule import Schedule
@@ -18,6 +19,7 @@ from marlyap.learning.source import CostWindow, shape
 from marlyap.learning.trainer import Trainer
 from marlyap.nets.nets import Greedy, Sampled
 from marlyap.seeds import stream
+from marlyap.simulation import evaluation
 from marlyap.simulation.evaluation import compare, episode, evaluate, pooled
 from marlyap.simulation.rollout import Decentralised
 from marlyap.tasks import Rendezvous
@@ -340,3 +342,19 @@ def test_no_episodes_are_refused(game):
 def test_a_controller_of_the_wrong_shape_is_refused(game):
     with pytest.raises(UserError, match=r"^controller: it returns an action of shape \[3\], "):
         evaluate(game, lambda state, key: jnp.zeros(3), 4)
+
+
+def test_an_evaluation_in_parts_is_that_of_the_whole(monkeypatch):
+    """Rollouts that do not fit into memory are played a few at a time, on the same starts."""
+    game = Rendezvous(agents=2, horizon=5)
+    controller = CONTROLLERS["tree-pursuit"](game)
+    whole = evaluate(game, controller, 10, seed=3)
+    counted, play = [], evaluation.outcomes
+    seen = lambda g, c, keys, beyond: (counted.append(len(keys)), play(g, c, keys, beyond))[1]
+    monkeypatch.setattr(evaluation, "outcomes", seen)
+    numbers = game.agents + sum(x.size for x in jax.tree.leaves(game.reset(jax.random.key(0))))
+    monkeypatch.setattr(evaluation, "ROOM", 4 * numbers * 50)
+    in_parts = evaluate(game, controller, 10, seed=3)
+    assert counted == [4, 4, 2]
+    for field in ("final", "total", "cost", "settled", "successes"):
+        np.testing.assert_allclose(getattr(in_parts, field), getattr(whole, field), rtol=1e-5)

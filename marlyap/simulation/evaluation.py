@@ -22,6 +22,7 @@ TIMES = (0.5, 1.0, 1.5, 2.0, 3.0)  # the edge of success, for the success curve
 HELD = 5  # steps over which `held` looks back
 REST = 0.1  # m/s and rad/s: an agent that moves and turns no faster is at rest
 RESTS = "comes to rest"  # said of a team that does
+ROOM = 10**8  # numbers of the rollouts that are in memory at once
 BEYOND = 9  # horizons after the first over which an evaluation looks whether a team stays
 
 
@@ -105,6 +106,16 @@ def episode(game: AbstractGame, controller: Controller, key: Key, beyond: int = 
 def outcomes(game: AbstractGame, controller: Controller, keys: Keys, beyond: int = 0) -> Outcome:
     """One outcome for every key."""
     return jax.vmap(lambda k: outcome(game, episode(game, controller, k, beyond)))(keys)
+
+
+def _in_parts(game: AbstractGame, controller: Controller, keys: Keys, beyond: int) -> Outcome:
+    """The outcomes, of as many episodes at once as there is room for: whole rollouts are kept."""
+    state = eqx.filter_eval_shape(game.reset, jax.random.key(0))
+    numbers = sum(leaf.size for leaf in jax.tree.leaves(state)) + game.agents
+    n = max(1, ROOM // (numbers * (game.horizon + beyond)))
+    some = [keys[k : k + n] for k in range(0, len(keys), n)]
+    parts = [outcomes(game, controller, part, beyond) for part in some]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
 @eqx.filter_jit
@@ -210,7 +221,7 @@ def evaluate(
         beyond = BEYOND * game.horizon if beyond is None else beyond
         if not 0 <= beyond <= 1_000_000:
             raise UserError(f"beyond: {beyond} steps is out of range; take 0 to 1000000.")
-        out = outcomes(game, controller, keys, beyond)
+        out = _in_parts(game, controller, keys, beyond)
     found = {k: np.asarray(v) for k, v in vars(out).items() if k != "success"}
     kind = {"edge": game.edge, "unit": game.unit, "mapped": mapped(game)}
     return Evaluation(np.asarray(out.success), **found, **kind, beyond=beyond)
