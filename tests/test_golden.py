@@ -25,6 +25,7 @@ from marlyap.tasks.coverage import Density
 from marlyap.tasks.estimation import Target
 from marlyap.tasks.flock import Wind
 from marlyap.tasks.frequency import Disturbance
+from marlyap.tasks.gnn_flock import Push
 from marlyap.tasks.microgrid import Loads
 from marlyap.tasks.networks import new_england
 from marlyap.tasks.platoon import Road
@@ -138,7 +139,7 @@ def flock(start):
 
 
 def gnn_flock(start):
-    return jnp.concatenate([start["q"], start["p"]], axis=-1), None
+    return jnp.concatenate([start["q"], start["p"]], axis=-1), Push(0 * start["p"])
 
 
 CASES = {

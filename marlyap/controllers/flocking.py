@@ -4,9 +4,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from marlyap.controllers.controller import AbstractController, as_action
-from marlyap.games.dynamics import DoubleIntegrator
 from marlyap.tasks.flock import Flock, PointMasses
-from marlyap.tasks.gnn_flock import GnnFlock
+from marlyap.tasks.gnn_flock import GnnFlock, HeldPointMasses
 from marlyap.types import State
 
 
@@ -72,7 +71,7 @@ class Alignment(AbstractController):
     Reynolds, Computer Graphics 21(4), 1987.
     """
 
-    drives = (PointMasses, DoubleIntegrator)
+    drives = (PointMasses, HeldPointMasses)
 
     game: Flock | GnnFlock
     gain: float = 1.0
@@ -87,7 +86,7 @@ class Alignment(AbstractController):
 class Braking(AbstractController):
     """Everybody knows the mean velocity and takes it as fast as the limits allow: centralised."""
 
-    drives = (PointMasses, DoubleIntegrator)
+    drives = (PointMasses, HeldPointMasses)
 
     game: Flock | GnnFlock
 

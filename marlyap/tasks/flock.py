@@ -45,7 +45,12 @@ class PointMasses(AbstractPlant):
     coupled: ClassVar[bool] = False
 
     def field(self, x, u, scenario, time):
-        return jnp.concatenate([x[:, 2:], u + scenario.push], axis=1)
+        return pushed(x, u + scenario.push)
+
+
+def pushed(x: Float[Array, "agent 4"], a: Float[Array, "agent 2"]) -> Float[Array, "agent 4"]:
+    """The rates of places and velocities under these accelerations."""
+    return jnp.concatenate([x[:, 2:], a], axis=1)
 
 
 def around(

@@ -1,23 +1,45 @@
 """Alignment: a flock that sees only those nearby comes to one velocity."""
 
 from functools import lru_cache
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from marlyap.errors import UserError, check_range
-from marlyap.games.dynamics import DoubleIntegrator, Independent
 from marlyap.games.game import AbstractRegulation, Tolerance
+from marlyap.games.physics import AbstractPlant, Integrator
 from marlyap.games.sensing import beside_entries, length
-from marlyap.tasks.flock import SEEN, around, flying
+from marlyap.tasks.flock import SEEN, PointMasses, around, flying, pushed
 from marlyap.threefry import uniform
-from marlyap.types import State
+from marlyap.types import Entry, State
 
 
-BANK, DRAWN, TRIES = 512, 2000, 200  # starts that are kept, drawn at once, and how often
+BANK = 10_000  # agents in all the starts that are kept
+PAIRS, TRIES = 400_000, 2_000  # of agents in the starts that are drawn at once, and how often
+
+
+class Push(eqx.Module):
+    """The scenario: what moves the agents beside themselves."""
+
+    push: Float[Array, "agent 2"]  # a steady acceleration of each (m/s^2)
+
+
+class HeldPointMasses(AbstractPlant):
+    """q' = p, p' = u + push: each agent by itself, exact for inputs that are held in a step."""
+
+    limits: tuple[float, ...] = (10.0, 10.0)  # largest ax and ay (m/s^2)
+    integrator: Integrator = "rk4"
+    states: ClassVar[tuple[Entry, ...]] = PointMasses.states
+    inputs: ClassVar[tuple[Entry, ...]] = PointMasses.inputs
+    blocks: ClassVar[tuple[tuple[int, ...], ...]] = PointMasses.blocks
+    coupled: ClassVar[bool] = False
+
+    def field(self, x, u, scenario, time):
+        return pushed(x, u + scenario.push)
 
 
 class GnnFlock(AbstractRegulation):
@@ -32,11 +54,12 @@ class GnnFlock(AbstractRegulation):
 
     agents: int = 20  # N
     graph: str = "disk:0.9"  # who sees whom
-    dynamics: DoubleIntegrator = DoubleIntegrator((10.0, 10.0), "rk4")  # exact for held inputs
+    plant: HeldPointMasses = HeldPointMasses()  # pyright: ignore
     speed: float = 3.0  # velocities are uniform up to this, about one that is, too (m/s)
     near: float = 0.5  # an agent this close to the mean velocity has arrived (m/s)
     reach: float = 0.9  # everybody starts with two neighbours within this (m)
     apart: float = 0.1  # and nobody closer than this (m)
+    push: float = 0.0  # largest steady acceleration of each agent in x and y (m/s^2)
     dt: float = 0.01  # s
     horizon: int = 200  # steps in an episode
 
@@ -44,14 +67,9 @@ class GnnFlock(AbstractRegulation):
         for name in ("speed", "near", "reach"):
             check_range(name, getattr(self, name), 0, 1e6, open=True)
         check_range("apart", self.apart, 0, 1e6)
-
-    @property
-    def plant(self) -> Independent:
-        return Independent(self.dynamics)  # pyright: ignore
-
-    def strengthened(self, gain):
-        limits = lambda game: game.dynamics.limits
-        return eqx.tree_at(limits, self, tuple(gain * u for u in limits(self)))
+        check_range("push", self.push, 0, min(self.plant.limits))
+        if self.agents < 3:
+            raise UserError("agents: everybody needs two neighbours; take 3 or more.")
 
     @property
     def edge(self):
@@ -67,7 +85,7 @@ class GnnFlock(AbstractRegulation):
         return tuple(Tolerance(told.format(axis), "m/s", self.near, "world") for axis in "xy")
 
     def reset(self, key):
-        k_which, k_turn, k_each, k_all = jax.random.split(key, 4)
+        k_which, k_turn, k_each, k_all, k_push = jax.random.split(key, 5)
         places = jnp.asarray(bank(self.agents, self.reach, self.apart))
         q = places[jax.random.randint(k_which, (), 0, len(places))]
         turn = jax.random.uniform(k_turn, (), maxval=2 * jnp.pi)
@@ -75,7 +93,8 @@ class GnnFlock(AbstractRegulation):
         q = jnp.stack([c * q[:, 0] - s * q[:, 1], s * q[:, 0] + c * q[:, 1]], axis=1)
         v = jax.random.uniform(k_each, (self.agents, 2), minval=-1.0)
         v = self.speed * (v + jax.random.uniform(k_all, (1, 2), minval=-1.0))
-        return State(x=jnp.concatenate([q, v], axis=1), scenario=None, t=jnp.asarray(0))
+        push = Push(self.push * jax.random.uniform(k_push, (self.agents, 2), minval=-1.0))
+        return State(x=jnp.concatenate([q, v], axis=1), scenario=push, t=jnp.asarray(0))
 
     def observe(self, state, links):
         """Of those nearby, the place and the velocity against its own; nothing else."""
@@ -90,6 +109,9 @@ class GnnFlock(AbstractRegulation):
 
     def distance(self, state):
         return length(self.errors(state))
+
+    def hold(self, state):
+        return -state.scenario.push / jnp.asarray(self.plant.limits)[None]
 
     def costs(self, state, action):
         return jnp.sum(self.errors(state) ** 2, axis=1)
@@ -116,15 +138,16 @@ def bank(agents: int, reach: float, apart: float) -> Float[np.ndarray, "start ag
     Raises UserError where hardly any draw is like that.
     """
     kept, themselves = [], np.diag(np.full(agents, np.inf))
+    many, drawn = max(1, BANK // agents), max(1, PAIRS // agents**2)
     for seed in range(TRIES):
         key = np.zeros(1, np.uint32), np.array([seed], np.uint32)
-        share, turn = np.moveaxis(uniform(key, DRAWN, agents, 2)[0], -1, 0)
+        share, turn = np.moveaxis(uniform(key, drawn, agents, 2)[0], -1, 0)
         radius, angle = np.sqrt(share * np.sqrt(agents)), 2 * np.pi * turn
         q = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
         gap = np.sum((q[:, None] - q[:, :, None]) ** 2, axis=-1) + themselves
         near = (gap < reach**2).sum(axis=2)
         fine = (gap.min(axis=(1, 2)) > apart**2) & (near.min(axis=1) >= 2)
         kept += list(q[fine])
-        if len(kept) >= BANK:
-            return np.array(kept[:BANK], np.float32)
+        if len(kept) >= many:
+            return np.array(kept[:many], np.float32)
     raise UserError(f"reach: hardly any start of {agents} agents is like that; make it larger.")
