@@ -125,13 +125,14 @@ def test_the_target_set_is_kept_by_the_action_that_holds_it(game):
         size = jnp.max(jnp.abs(state.x), axis=0)
         close = jnp.abs(game.errors(after)) <= 1e-5 * (1 + jnp.max(size))
         zero = [game.errors(state), game.distance(state), game.costs(state, action)]
-        return game.success(state), game.failed(state), jnp.all(close), zero
+        round_off = jnp.finfo(state.x.dtype).eps * jnp.max(size)
+        return game.success(state), game.failed(state), jnp.all(close), zero, round_off
 
     for seed in range(4):
-        success, failed, close, zero = there(jax.random.key(seed))
+        success, failed, close, zero, round_off = there(jax.random.key(seed))
         assert success and not failed and close
         for values in zero:
-            np.testing.assert_allclose(values, 0, atol=1e-6)
+            np.testing.assert_allclose(values, 0, atol=1e-6 + 2 * round_off)
 
 
 @every_game

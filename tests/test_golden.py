@@ -74,7 +74,8 @@ def platoon(start):
 def quads(task):
     def parts(start):
         goal = start["goal"][None] + jnp.asarray(TASKS[task].places, start["goal"].dtype)
-        return start["x"], Flight(goal=goal, gust=0 * goal, begins=0 * goal[0, 0])
+        one = jnp.ones_like(goal[:, 0])
+        return start["x"], Flight(goal=goal, gust=0 * goal, begins=0 * one[0], inertia=one)
 
     return parts
 

@@ -5,7 +5,8 @@ from jaxtyping import Array, Float
 
 from marlyap.controllers.controller import AbstractController, as_action, needs_a_chain
 from marlyap.games.quadrotors import PlanarQuads, SpaceQuads, turned
-from marlyap.tasks.quads import PlanarFormation, SpaceFormation
+from marlyap.tasks.quads_planar import PlanarFormation
+from marlyap.tasks.quads_space import SpaceFormation
 from marlyap.types import State
 
 

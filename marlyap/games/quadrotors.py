@@ -13,11 +13,12 @@ from marlyap.types import Entry, Scalar
 
 
 class Flight(eqx.Module):
-    """The scenario: where to go, and the wind of this episode."""
+    """The scenario: where to go, the wind of this episode, and how hard the bodies are to turn."""
 
     goal: Float[Array, "agent d"]  # the place of each quadrotor (m)
     gust: Float[Array, "agent d"]  # its acceleration by the gust while it lasts (m/s^2)
     begins: Scalar  # when the gust begins (s)
+    inertia: Float[Array, "agent"]  # of each body, in multiples of the plant's
 
 
 class AbstractFlyers(AbstractPlant):
@@ -85,7 +86,8 @@ class PlanarQuads(AbstractFlyers):
         pitch, f = x[:, 2], self.mass * self.gravity / 2 + u
         up = jnp.stack([-jnp.sin(pitch), jnp.cos(pitch)], axis=1)
         push = jnp.sum(f, axis=1, keepdims=True) / self.mass * up + self.wind(scenario, time)
-        turn = (f[:, 1:] - f[:, :1]) * self.arm / (2**0.5 * self.inertia)
+        inertia = self.inertia * scenario.inertia[:, None]
+        turn = (f[:, 1:] - f[:, :1]) * self.arm / (2**0.5 * inertia)
         fall = jnp.array([[0.0, self.gravity]])
         return jnp.concatenate([x[:, 3:5], x[:, 5:], push - fall, turn], axis=1)
 
@@ -106,7 +108,8 @@ class SpaceQuads(AbstractFlyers):
         v' = T R(q) e_z - g e_z - k v,   q' = q (0, w) / 2,   w' = (asked - w) / lag,
 
     with q the quaternion (w, x, y, z) from body to world, kept at length 1, and T = g + u_0 the
-    thrust over the mass (m/s^2). A loop of its own, with the time constant `lag`, makes the rates.
+    thrust over the mass (m/s^2). A loop of its own makes the rates; its time constant `lag` grows
+    with the body's inertia.
     """
 
     limits: tuple[float, ...] = (4.9, 3.0, 3.0, 1.0)  # largest T - g (m/s^2) and rates (rad/s)
@@ -150,7 +153,8 @@ class SpaceQuads(AbstractFlyers):
         real, imaginary = q[:, :1], q[:, 1:]
         spun = -jnp.sum(imaginary * w, axis=1, keepdims=True)
         spin = jnp.concatenate([spun, real * w + jnp.cross(imaginary, w)], axis=1) / 2
-        return jnp.concatenate([v, push, spin, (u[:, 1:] - w) / self.lag], axis=1)
+        lag = self.lag * scenario.inertia[:, None]
+        return jnp.concatenate([v, push, spin, (u[:, 1:] - w) / lag], axis=1)
 
     def step(self, x, u, scenario, time, dt):
         return unit(super().step(x, u, scenario, time, dt))

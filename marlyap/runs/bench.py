@@ -13,6 +13,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from marlyap.controllers import CONTROLLERS, AbstractController
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
@@ -103,7 +105,11 @@ def bench(asked: Sequence[Cell], plan: Plan, out: Path) -> Iterator[tuple[Cell, 
 
     Raises UserError where `out` cannot be written.
     """
+    before = None
     for cell in asked:
+        if before not in (None, cell.game):
+            jax.clear_caches()  # compiled programs fill the memory maps that a process may have
+        before = cell.game
         whole = cell.asked | dataclasses.asdict(plan) | {"code": code()}
         name = f"{cell.controller}-{cell.horizons}".replace("/", "+")
         file = out / "cells" / cell.game / f"{name}.json"

@@ -12,10 +12,8 @@ from marlyap.tasks.frequency import Frequency as Frequency, SwingEquations
 from marlyap.tasks.gnn_flock import GnnFlock as GnnFlock
 from marlyap.tasks.microgrid import Microgrid as Microgrid
 from marlyap.tasks.platoon import Platoon as Platoon
-from marlyap.tasks.quads import (
-    PlanarFormation as PlanarFormation,
-    SpaceFormation as SpaceFormation,
-)
+from marlyap.tasks.quads_planar import PlanarFormation as PlanarFormation
+from marlyap.tasks.quads_space import SpaceFormation as SpaceFormation
 from marlyap.tasks.rendezvous import Rendezvous as Rendezvous
 from marlyap.tasks.ring import Ring as Ring
 from marlyap.tasks.voltage import PowerFlow, Voltage as Voltage

@@ -1,4 +1,4 @@
-"""Quadrotors in formation: planar ones in a row, and those in space at the corners of squares."""
+"""What quadrotors in formation share, planar or in space."""
 
 import abc
 import dataclasses
@@ -12,18 +12,18 @@ from jaxtyping import Float
 from marlyap.errors import check_range
 from marlyap.games.game import AbstractRegulation, Tolerance
 from marlyap.games.planar import check_leaders
-from marlyap.games.quadrotors import AbstractFlyers, Flight, PlanarQuads, SpaceQuads, unit
+from marlyap.games.quadrotors import AbstractFlyers, Flight
 from marlyap.games.sensing import beside, beside_entries, near
 from marlyap.tasks.cartpoles import check_weights
-from marlyap.types import Entry, Key, Scene, State
+from marlyap.types import Entry, Key, Scene
 
 
 class AbstractQuads(AbstractRegulation):
     """Quadrotors that hover at their places; only leaders know theirs.
 
-    All share a compass and know the displacements between their places. The cost of one is
-    |goal - p|^2 + 0.1 |v|^2 + 0.1 |tilt|^2 + 0.01 |rates|^2 + 0.01 |a|^2. The team fails when one
-    is upside down, or farther than `most` from its place along an axis.
+    All share a compass and know the displacements between their places. The cost of one weighs the
+    squares of its gap, velocity, tilt, rates and action. The team fails when one is upside down, or
+    farther than `most` from its place along an axis.
     """
 
     plant: eqx.AbstractVar[AbstractFlyers]  # pyright: ignore
@@ -34,6 +34,7 @@ class AbstractQuads(AbstractRegulation):
     weights: eqx.AbstractVar[tuple[float, ...]]
     effort: eqx.AbstractVar[float]
     gust: eqx.AbstractVar[float]
+    inertia_spread: eqx.AbstractVar[float]
     spacing: eqx.AbstractVar[float]
     size: eqx.AbstractVar[float]
 
@@ -42,6 +43,7 @@ class AbstractQuads(AbstractRegulation):
             check_range(name, getattr(self, name), 0, 1e6, open=True)
         for name in ("effort", "gust", "spacing", "size"):
             check_range(name, getattr(self, name), 0, 1e6)
+        check_range("inertia_spread", self.inertia_spread, 0, 0.99)
         check_weights(self.weights, 4)
         check_leaders(self.leaders, self.agents)
 
@@ -66,13 +68,14 @@ class AbstractQuads(AbstractRegulation):
 
     def flight(self, key: Key) -> Flight:
         """The scenario of an episode."""
-        k_goal, k_gust, k_time = jax.random.split(key, 3)
-        d = len(self.plant.ways)
+        k_goal, k_gust, k_time, k_body = jax.random.split(key, 4)
+        n, d = self.agents, len(self.plant.ways)
         centre = jax.random.uniform(k_goal, (d,), minval=-self.size, maxval=self.size)
         return Flight(
             goal=centre[None] + jnp.asarray(self.places, jnp.float32),
-            gust=self.gust * jax.random.uniform(k_gust, (self.agents, d), minval=-1.0),
+            gust=self.gust * jax.random.uniform(k_gust, (n, d), minval=-1.0),
             begins=jax.random.uniform(k_time, ()) * self.horizon * self.dt,
+            inertia=1 + self.inertia_spread * jax.random.uniform(k_body, (n,), minval=-1.0),
         )
 
     def observe(self, state, links):
@@ -156,79 +159,3 @@ class AbstractQuads(AbstractRegulation):
     def resized(self, agents):
         leaders = tuple(i for i in self.leaders if i < agents)
         return dataclasses.replace(self, agents=agents, leaders=leaders)  # pyright: ignore
-
-
-class PlanarFormation(AbstractQuads):
-    """Three planar quadrotors hover in a row; only the first is told its place."""
-
-    agents: int = 3  # N
-    leaders: tuple[int, ...] = (0,)  # the agents that are told their place
-    graph: str = "path"  # who sees whom
-    plant: PlanarQuads = PlanarQuads()  # pyright: ignore
-    spacing: float = 0.5  # between the places (m)
-    size: float = 0.5  # places of agent 0 are uniform in [-size, size]^2 (m)
-    radius: float = 0.1  # a quadrotor this close to its place has arrived (m)
-    calm: float = 0.1  # if it is also no faster than this (m/s)
-    most: float = 5.0  # farther from a place the team has failed (m)
-    weights: tuple[float, ...] = (1.0, 0.1, 0.1, 0.01)  # of squared gap, velocity, tilt and rates
-    effort: float = 0.01  # weight of the squared action in the cost
-    gust: float = 0.0  # largest acceleration by a gust, at a random time of an episode (m/s^2)
-    start: tuple[float, ...] = (1.0, 0.5, 0.2, 0.1, 0.1, 0.1)  # of each state, up to (m, rad, s)
-    dt: float = 0.02  # s
-    horizon: int = 250  # steps in an episode
-
-    def __check_init__(self):
-        check_weights(self.start, 6, "start")
-
-    @property
-    def places(self):
-        return self.spacing * np.arange(self.agents)[:, None] * np.array([[1.0, 0.0]])
-
-    def reset(self, key):
-        k_x, k_flight = jax.random.split(key)
-        off = jax.random.uniform(k_x, (self.agents, 6), minval=-1.0) * jnp.array([self.start])
-        middle = self.places - self.places.mean(axis=0)
-        x = self.plant.hovering(jnp.asarray(middle, jnp.float32)) + off
-        return State(x=x, scenario=self.flight(k_flight), t=jnp.asarray(0))
-
-
-class SpaceFormation(AbstractQuads):
-    """Four quadrotors hover at the corners of a tilted square; only the first is told its place."""
-
-    agents: int = 4  # N
-    leaders: tuple[int, ...] = (0,)  # the agents that are told their place
-    graph: str = "path"  # who sees whom
-    plant: SpaceQuads = SpaceQuads()  # pyright: ignore
-    spacing: float = 0.5  # side of the square, and between squares of four, one above another (m)
-    size: float = 0.5  # places of agent 0 are uniform in [-size, size]^3 (m)
-    radius: float = 0.1  # a quadrotor this close to its place has arrived (m)
-    calm: float = 0.1  # if it is also no faster than this (m/s)
-    most: float = 5.0  # farther from a place the team has failed (m)
-    weights: tuple[float, ...] = (1.0, 0.1, 0.1, 0.01)  # of squared gap, velocity, tilt and rates
-    effort: float = 0.01  # weight of the squared action in the cost
-    gust: float = 0.0  # largest acceleration by a gust, at a random time of an episode (m/s^2)
-    start: tuple[float, ...] = (1.0, 0.1, 0.1, 0.1)  # places, velocities, quaternions, rates, up to
-    dt: float = 0.02  # s
-    horizon: int = 250  # steps in an episode
-
-    def __check_init__(self):
-        check_weights(self.start, 4, "start")
-
-    @property
-    def places(self):
-        corner, layer = np.arange(self.agents) % 4, np.arange(self.agents) // 4
-        raised = np.where(corner == 3, 0.5, 0.0) + layer
-        return self.spacing * np.stack([corner % 3 > 0, corner >= 2, raised], axis=1)
-
-    def reset(self, key):
-        k_x, k_flight = jax.random.split(key)
-        most = jnp.repeat(jnp.array(self.start), jnp.array([3, 3, 4, 3]), total_repeat_length=13)
-        off = most[None] * jax.random.uniform(k_x, (self.agents, 13), minval=-1.0)
-        level = self.plant.hovering(jnp.zeros((self.agents, 3)))
-        x = unit(level + off.at[:, 6].set(0.0))
-        return State(x=x, scenario=self.flight(k_flight), t=jnp.asarray(0))
-
-    def farther(self, state, factor):
-        there = self.at_target(state).x
-        x = unit(there + factor * (state.x - there))
-        return eqx.tree_at(lambda s: s.x, state, x)
