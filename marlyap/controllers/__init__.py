@@ -16,6 +16,7 @@ from marlyap.controllers.flocking import (
     Braking as Braking,
     FreeFlock as FreeFlock,
     OlfatiSaber as OlfatiSaber,
+    Tanner as Tanner,
 )
 from marlyap.controllers.formation_feedback import (
     FormationConsensus as FormationConsensus,
@@ -82,6 +83,7 @@ CONTROLLERS: dict[str, type[AbstractController]] = {
     "olfati-saber": OlfatiSaber,
     "olfati-saber-free": FreeFlock,
     "alignment": Alignment,
+    "tanner": Tanner,
     "braking": Braking,
     "zero": Zero,
     "hold": Hold,

@@ -9,7 +9,7 @@ from marlyap.tasks.estimation import Estimation, Prediction
 
 
 class Laplacian(AbstractController):
-    """u_i = growth eps sum_j (x_j - x_i), with one weight eps for all edges.
+    """Feedback u_i = growth eps sum_j (x_j - x_i), with one weight eps for all edges.
 
     The best is eps = 2 / (l_2 + l_N), by the eigenvalues of the graph's Laplacian: Xiao and Boyd,
     Systems and Control Letters 53, 2004.
@@ -31,7 +31,7 @@ class Laplacian(AbstractController):
 
 
 class ConsensusFilter(AbstractController):
-    """u_i = k H_i' (y_i - H_i x_i) + c sum_j (x_j - x_i): own measurement, neighbours' estimates.
+    """Correction k H_i' (y_i - H_i x_i) + c sum_j (x_j - x_i): own measurement, others' estimates.
 
     The Kalman consensus filter with constant gains: Olfati-Saber, Proc. IEEE Conf. Decision and
     Control, 2009. The gains minimise the expected cost of the game without limits; there the

@@ -8,7 +8,7 @@ from marlyap.tasks.frequency import Frequency, SwingEquations
 
 
 class Droop(AbstractController):
-    """u_i = k_i w_i with the gains that Cui, Jiang and Zhang publish beside their networks.
+    """Droop u_i = k_i w_i, with the gains that Cui, Jiang and Zhang publish beside their networks.
 
     IEEE Trans. Power Systems 38(2), 2023. Any increasing u_i(w_i) with u_i(0) = 0 makes the energy
 
@@ -36,7 +36,7 @@ class Droop(AbstractController):
 
 
 class SteepDroop(AbstractController):
-    """u_i = u_max,i w_i / span: every machine gives its all from the same deviation on."""
+    """Droop u_i = u_max,i w_i / span: every machine gives its all from the same deviation on."""
 
     drives = (SwingEquations,)
 

@@ -1,4 +1,4 @@
-"""Laws for flocks: Olfati-Saber's two algorithms, alignment, and braking with all that is known."""
+"""Laws for flocks: Olfati-Saber's and Tanner's, alignment, and braking by all that is known."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -66,7 +66,7 @@ class FreeFlock(AbstractController):
 
 
 class Alignment(AbstractController):
-    """u_i = gain (mean velocity of i and those it sees - v_i) / dt: Reynolds' second rule.
+    """Reynolds' second rule: u_i = gain (mean velocity of i and those it sees - v_i) / dt.
 
     Reynolds, Computer Graphics 21(4), 1987.
     """
@@ -81,6 +81,28 @@ class Alignment(AbstractController):
         gap = jnp.where(linked[..., None], v[None, :] - v[:, None], 0.0)
         mean = jnp.sum(gap, axis=1) / (1 + jnp.sum(linked, axis=1))[:, None]
         return as_action(self.game, self.gain * mean / self.game.dt)
+
+
+class Tanner(AbstractController):
+    """Alignment and a potential of distance, of those nearby: the usual baseline of GNN flocking.
+
+    u_i = -sum_j (p_i - p_j) - sum_j grad V(q_i - q_j), V = 1 / r^2 + log r^2: Tanner, Jadbabaie and
+    Pappas, Proc. IEEE Conf. Decision and Control, 2003. With a limited sight the repulsion blows
+    flocks apart; `everybody` aligns with all, as the expert of Tolstaya et al. does.
+    """
+
+    drives = (PointMasses, HeldPointMasses)
+
+    game: Flock | GnnFlock
+    everybody: bool = False
+
+    def __call__(self, state, key):
+        linked = self.game.linked(state)[..., None]
+        gap = state.x[:, None] - state.x[None, :]
+        squared = jnp.where(linked, jnp.sum(gap[..., :2] ** 2, axis=-1, keepdims=True), 1.0)
+        slope = jnp.where(linked, 2 * (1 / squared - 1 / squared**2) * gap[..., :2], 0.0)
+        seen = gap[..., 2:] if self.everybody else jnp.where(linked, gap[..., 2:], 0.0)
+        return as_action(self.game, -jnp.sum(seen + slope, axis=1))
 
 
 class Braking(AbstractController):

@@ -5,7 +5,7 @@ from marlyap.tasks.coverage import Coverage, Wheels
 
 
 class Lloyd(AbstractController):
-    """u_i = gain (C_i - p_i) / dt, C_i the centre of mass of the cell among those that i sees.
+    """Lloyd's law u_i = gain (C_i - p_i) / dt, C_i the centre of the cell among those that i sees.
 
     The mean squared distance to the nearest robot falls in every step: Lloyd, IEEE Trans.
     Information Theory 28(2), 1982; Cortes et al., IEEE Trans. Robotics and Automation 20(2), 2004.

@@ -10,7 +10,7 @@ from marlyap.types import Action
 
 
 class DeadBand(AbstractController):
-    """u_i = slope times how far v_i lies outside [low, high].
+    """Feedback u_i = slope times how far v_i lies outside [low, high].
 
     Stable, without load, for slopes below 2 / l_max(X), X = dv/dq: Feng et al., IEEE Trans. Control
     of Network Systems, 2023.
@@ -48,7 +48,7 @@ class MildDeadBand(AbstractController):
 
 
 class LinearVoltage(AbstractController):
-    """u_i = slope (v_i - 1), without a dead band: inverters with different voltages never rest."""
+    """Feedback slope (v_i - 1) without a dead band: inverters with different voltages never rest."""
 
     drives = (PowerFlow,)
 

@@ -42,6 +42,9 @@ FAMILIES: dict[type, dict[str, Any]] = {
 WORDS = {AbstractGame: "task", AbstractAlgorithm: "algorithm"}
 
 
+MOST_NAMES = 40  # in one sentence
+
+
 class UnknownCode(UserError):
     """A record names a class that is neither marlyap's nor named by the user."""
 
@@ -60,7 +63,11 @@ def suggest(word: str, among: Iterable[str]) -> str:
     """What may have been meant, or what there is."""
     names = sorted(among)
     near = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
-    return f"did you mean '{near[0]}'?" if near else f"there is {', '.join(names) or 'none'}."
+    if near:
+        return f"did you mean '{near[0]}'?"
+    if len(names) > MOST_NAMES:
+        return f"there are {len(names)}, which `marlyap list` shows."
+    return f"there is {', '.join(names) or 'none'}."
 
 
 def load(name: str, family: type[T]) -> T:

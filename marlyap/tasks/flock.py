@@ -176,8 +176,8 @@ class Flock(AbstractRegulation):
 
     def at_target(self, state):
         """On a lattice of triangles about the leader, with its velocity."""
-        k = np.arange(-self.agents, self.agents + 1) if self.agents < 64 else np.arange(-80, 81)
-        a, b = (m.ravel() for m in np.meshgrid(k, k))
+        wide = int(self.agents**0.5) + 3
+        a, b = (m.ravel() for m in np.mgrid[-wide : wide + 1, -wide : wide + 1])
         points = np.stack([a + b / 2, b * 3**0.5 / 2], axis=1)
         first = np.argsort(np.linalg.norm(points, axis=1).round(6), kind="stable")[: self.agents]
         places = jnp.asarray(self.spacing * points[first], state.x.dtype)

@@ -25,7 +25,8 @@ class Network(eqx.Module):
 
     def flow(self, angle: Array, stronger: Array) -> Array:
         """What leaves each machine, lines being `stronger` times as strong (p.u.)."""
-        K = jnp.asarray(self.K) * stronger
+        # With its dtype told, JAX does not take the same array in another precision.
+        K = jnp.asarray(self.K, angle.dtype) * stronger
         return jnp.sum(K * jnp.sin(angle[:, None] - angle[None, :]), axis=1)
 
     @property
