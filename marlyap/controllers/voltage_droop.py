@@ -48,7 +48,7 @@ class MildDeadBand(AbstractController):
 
 
 class LinearVoltage(AbstractController):
-    """Feedback slope (v_i - 1) without a dead band: inverters with different voltages never rest."""
+    """Feedback slope (v_i - 1), no dead band: inverters with different voltages never rest."""
 
     drives = (PowerFlow,)
 
