@@ -225,7 +225,7 @@ GUARDS = [
     Guard(
         "24 typo",
         "marlyap/runs/config.py",
-        (("    return f\"did you mean '{near[0]}'?\" if near else", "    return"),),
+        (("        return f\"did you mean '{near[0]}'?\"\n", "        pass\n"),),
         "tests/test_config.py::test_unknown_names_are_refused_with_a_suggestion",
     ),
 ]

@@ -65,6 +65,7 @@ def test_the_truth_about_simulated_seeds(coverage):
     assert found["ones, three in ten from 0.4"] == pytest.approx((0.91, 0.995), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_no_sampled_certificate_is_wrong_more_often_than_it_says(coverage):
     rows = {row["kind"]: row for row in coverage.certificates(quick=True)}
     assert rows.keys() == coverage.KINDS.keys()

@@ -33,8 +33,8 @@ GAMES = VARIANTS | {f"TASKS[{k}]": g for k, g in TASKS.items() if g not in VARIA
 PLANAR = {k: g for k, g in GAMES.items() if isinstance(g, AbstractPlanar)}
 
 
-FAST = {"complete", "path", "disk", "late", "alone"}
-FAST |= {f"TASKS[{name}]" for name in ("formation", "microgrid", "platoon-catchup", "voltage13")}
+FAST = {"complete", "path", "disk"}
+FAST |= {f"TASKS[{name}]" for name in ("microgrid", "platoon-catchup", "voltage13")}
 
 
 def each(games):

@@ -56,6 +56,7 @@ def contents(directory):
     return {p: p.read_bytes() for p in directory.rglob("*") if p.suffix in (".csv", ".json")}
 
 
+@slow
 @every_script
 def test_the_quick_form(name, script, places, monkeypatch, capsys):
     about, cases = SCRIPTS[name], 2

@@ -105,6 +105,7 @@ def test_the_same_weights_serve_any_number_of_agents(shape):
         np.testing.assert_allclose(mode(pi, o), want, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_batch_in_parts_descends_as_the_whole(monkeypatch):
     """Large teams take a batch in parts, so that what it passes through stays in the cache."""
     assert [optimiser.parts(256, n) for n in (3, 8, 16, 32, 128, 1000)] == [1, 1, 8, 16, 64, 256]

@@ -33,7 +33,13 @@ def played(game, law, key):
     return jax.vmap(one)(jax.random.split(key, 6))
 
 
-@pytest.mark.parametrize(("task", "law", "option", "value"), OPTIONS)
+LARGE = ("quads-space", "ring")  # which take long to compile
+slowly = lambda task: [pytest.mark.slow] if task in LARGE else []
+
+
+@pytest.mark.parametrize(
+    ("task", "law", "option", "value"), [pytest.param(*o, marks=slowly(o[0])) for o in OPTIONS]
+)
 def test_an_option_disturbs_the_motion_and_not_the_target(task, law, option, value):
     nominal = replace(TASKS[task], horizon=200)
     game = replace(nominal, **{option: value})

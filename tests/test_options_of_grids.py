@@ -53,6 +53,7 @@ def test_an_option_disturbs_every_episode(task, law, option, value):
     assert np.isfinite(seen).all() and (off > 1e-6).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "law", "option", "value"), REST)
 def test_an_option_leaves_a_target_that_can_be_held(task, law, option, value):
     game = replace(TASKS[task], **{option: value})

@@ -136,9 +136,14 @@ CUTS = {
 }
 
 
+QUICK_CUTS = ("in mid run", "after each iteration")
+
+
 @pytest.mark.parametrize("seeds", [SINGLE, PAIR], ids=["single", "vmapped pair"])
 @pytest.mark.parametrize("name", ["masac-lyapunov", pytest.param("masac", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("cut", CUTS)
+@pytest.mark.parametrize(
+    "cut", [c if c in QUICK_CUTS else pytest.param(c, marks=pytest.mark.slow) for c in CUTS]
+)
 def test_a_stopped_run_ends_bit_for_bit_like_an_uninterrupted_one(
     cut, name, seeds, uninterrupted, tmp_path
 ):

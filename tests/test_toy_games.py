@@ -117,7 +117,7 @@ def look(trainer, networks):
     return *jax.vmap(one)(KEYS), outcomes(game, Decentralised(policy, game), KEYS).final
 
 
-QUICKEST = ("masac", "masac-lyapunov", "decentralised-sac", "matd3")
+QUICKEST = ("masac", "masac-lyapunov", "matd3")
 OTHERS = [pytest.param(n, marks=pytest.mark.slow) for n in ALGORITHMS if n not in QUICKEST]
 
 
