@@ -5,6 +5,7 @@ to check the package, and what is imported by then stays unchecked (test_floors.
 """
 
 import gc
+import itertools
 import os
 from pathlib import Path
 
@@ -25,6 +26,7 @@ PLAIN = "--xla_cpu_use_fusion_emitters=false"
 if PLAIN not in os.environ.get("XLA_FLAGS", "") and jax.__version_info__ < (0, 11):
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {PLAIN}".strip()
 
+TESTS = itertools.count(1)
 MAPS = 25_000  # in use when a module ends; one module adds up to 10,000
 
 
@@ -50,17 +52,29 @@ def single_precision():
     assert not jax.config.jax_enable_x64
 
 
-@pytest.fixture(autouse=True, scope="module")
-def room_for_programs():
-    """Forget compiled programs in time: each takes ten memory maps, and Linux allows 65,530.
+def make_room(most):
+    """Forget compiled programs where more than `most` memory maps are in use.
 
-    XLA does not survive the failure of the next one; a whole suite in two processes comes that far.
+    Each takes ten, and Linux allows 65,530. XLA does not survive the failure of the next one; a
+    whole suite in two processes comes that far.
     """
-    yield
     maps = Path("/proc/self/maps")
-    if maps.exists() and len(maps.read_bytes().splitlines()) > MAPS:
+    if maps.exists() and len(maps.read_bytes().splitlines()) > most:
         jax.clear_caches()
         gc.collect()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def room_for_programs():
+    yield
+    make_room(MAPS)
+
+
+@pytest.fixture(autouse=True)
+def room_within_a_module():
+    yield
+    if next(TESTS) % 10 == 0:
+        make_room(MAPS + 15_000)
 
 
 def optimise(fully):

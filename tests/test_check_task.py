@@ -420,6 +420,7 @@ ALSO = {  # other laws that the same mistake may break
     NoCost: {"rewards"},
     EverybodySeesEverybody: {"links"},
     FollowersSeeTheirGoal: {"links"},
+    GoalMoves: {"target"},
     OverAtOnce: {"termination"},
     WorldIsATorus: {"bounded_inputs"},
 }
