@@ -28,7 +28,9 @@ def options(p: ArgumentParser) -> None:
     p.add_argument("--seed", type=seed_of_starts, default=0, help=SEED)
     longer = "how many horizons the second measurement takes (default 10)"
     p.add_argument("--longer", type=number, default=10, help=longer)
-    p.add_argument("--quick", action="store_true", help="20 starts and 2 horizons, to try it out")
+    p.add_argument(
+        "--quick", action="store_true", help="at most 20 starts and 2 horizons, to try it out"
+    )
     out = "directory for the figures, the CSV and the page (default runs/bench)"
     p.add_argument("--out", type=place, default=Path("runs/bench"), help=out)
 
@@ -52,15 +54,16 @@ def run(args: Namespace, overrides: Overrides) -> Result:
             hint = config.suggest(name, CONTROLLERS)
             raise UserError(f"controllers: there is none called '{name}'; {hint}")
     seed = starts_of(args.seed)
-    few = bench.Plan(20, seed, min(args.longer, 2))
+    few = bench.Plan(min(args.episodes, 20), seed, min(args.longer, 2))
     plan = few if args.quick else bench.Plan(args.episodes, seed, args.longer)
     runs = [Run.open(directory) for directory in expand(args.runs)]
     asked = bench.cells(games, args.controllers, runs, plan)
     rows: list[dict[str, Any]] = []
-    for number_, (cell, row) in enumerate(bench.bench(asked, plan, args.out), 1):
-        rows.append(bench.tidy(cell, row))
-        what = f"{cell.game}, {cell.controller}, {cell.horizons} horizon{'s' * (cell.horizons > 1)}"
-        say(f"{number_} of {len(asked)}: {what}: {100 * row['success_rate']:.1f} %")
+    for row in bench.bench(asked, plan, args.out):
+        rows.append(row)
+        many = f"{row['horizons']} horizon{'s' * (row['horizons'] > 1)}"
+        what = f"{row['game']}, {row['controller']}, {many}: {100 * row['success']:.1f} %"
+        say(f"{len(rows)} of {len(asked)}: {what}")
     store.write_text_atomic(args.out / "bench.csv", as_csv(rows, bench.COLUMNS))
     store.write_text_atomic(args.out / "bench.html", html(rows, plan.episodes, seed))
     if not args.json:

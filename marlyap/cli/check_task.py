@@ -35,6 +35,7 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     found = conformance(game, args.seed)
     broken = [f.law for f in found if f.faults]
     skipped = [f.law for f in found if f.faults is None]
+    waived = [f.law for f in found if f.waived]
     if not args.json:
         table = Table(title=escape(args.task), title_justify="left", show_header=False)
         for f in found:
@@ -42,16 +43,19 @@ def run(args: Namespace, overrides: Overrides) -> Result:
                 continue
             figures = ", ".join(f"{name} {value:.3g}" for name, value in f.figures.items())
             text = "\n".join(f.faults) or f.says + (f" ({figures})" if figures else "")
-            table.add_row(f.law, "broken" if f.faults else "kept", escape(text))
+            mark = "waived" if f.waived else "broken" if f.faults else "kept"
+            table.add_row(f.law, mark, escape(f.waived or text))
         if skipped:
             rest = f"{len(skipped)} laws need sound shapes: {', '.join(skipped)}"
             table.add_row("", "skipped", rest)
         Console().print(table)
         print(
-            f"{args.task}: {len(found) - len(broken) - len(skipped)} of {len(found)} laws kept",
+            f"{args.task}: {len(found) - len(broken) - len(skipped) - len(waived)} of "
+            f"{len(found)} laws kept",
             end="",
         )
         print(f", {len(skipped)} skipped" if skipped else "", end="")
+        print(f", {len(waived)} waived" if waived else "", end="")
         print(f"; broken: {', '.join(broken)}." if broken else ".")
-    laws = {f.law: {"says": f.says, "faults": f.faults, "figures": f.figures} for f in found}
+    laws = {f.law: {k: v for k, v in f._asdict().items() if k != "law"} for f in found}
     return {"task": args.task, "passes": not broken, "laws": laws}, int(bool(broken))

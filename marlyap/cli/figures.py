@@ -144,7 +144,7 @@ def columns(first: dict[str, Any], ruled: bool, fails: bool) -> list[Column]:
     half = f"{first['radii'][0]['radius']:.2g}".removeprefix("0")
     median = lambda name: lambda row: f"{row[name]['0.5']:.2f}" if name in row else ""
     interval = lambda row: "-".join(f"{100 * x:.1f}" for x in row["interval"])
-    every = [
+    return [
         Column("run", lambda row: escape(row["name"])),
         Column("success", share),
         Column(f"{100 * first['confidence']:g} %", interval),
@@ -160,7 +160,6 @@ def columns(first: dict[str, Any], ruled: bool, fails: bool) -> list[Column]:
         Column("rad/s", median("final_spin")),
         Column("settled", lambda row: number(row["settling_time"]["0.5"])),
     ]
-    return every
 
 
 def _spoken_of(rows: Sequence[dict[str, Any]], found: Sequence[groups.Measured]) -> list[bool]:

@@ -41,6 +41,11 @@ class Finding(NamedTuple):
     says: str
     faults: tuple[str, ...] | None  # None: it could not be tested
     figures: dict[str, float]
+    waived: str = ""  # why the law is not asked of this game, which is then not said to keep it
+
+
+class Waived(Exception):
+    """A law is not asked of a game, for the reason given."""
 
 
 def conformance(
@@ -59,11 +64,14 @@ def conformance(
         probe, faults = None, (_raised("task", error),)
     found = [Finding("shapes", _says(shapes), faults, {})]
     for law in laws:
-        faults, figures = None, {}
+        faults, figures, waived = None, {}, ""
         if probe:
             probe.figures = figures
-            faults = tuple(_caught(lambda law=law: law(probe)))
-        found.append(Finding(law.__name__, _says(law), faults, figures))
+            try:
+                faults = tuple(_caught(lambda law=law: law(probe)))
+            except Waived as why:
+                faults, waived = (), str(why)
+        found.append(Finding(law.__name__, _says(law), faults, figures, waived))
     return found
 
 
@@ -74,6 +82,8 @@ def _says(law: Callable) -> str:
 def _caught(law: Callable[[], Faults]) -> Faults:
     try:
         yield from law()
+    except Waived:
+        raise
     except Exception as error:
         yield _raised("task", error)
 
@@ -668,9 +678,9 @@ def violations(probe: Probe) -> Faults:
 
 
 def smooth_cost(probe: Probe) -> Faults:
-    """Costs are Lipschitz in states and actions (Assumption 1), where the game says so."""
+    """Costs are Lipschitz in states and actions (Assumption 1)."""
     if not probe.game.smooth:
-        return
+        raise Waived("the game says that its costs jump (`smooth`)")
     before, last = _steepest(probe, lambda out: out["cost"][:, None])
     probe.figures["slope"] = last
     if not last <= STEEPER * max(before, 1e-3):

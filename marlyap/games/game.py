@@ -94,7 +94,7 @@ class AbstractGame(eqx.Module):
     def edge_cost(self) -> float:
         """What a step costs an agent at the edge of success: the scale of small costs.
 
-        Without a word of the game, `edge`, as if the cost were the distance.
+        By default `edge`, as if the cost were the distance.
         """
         return self.edge
 

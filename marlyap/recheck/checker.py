@@ -176,7 +176,7 @@ def counted(v: dict[str, Any], c: dict[str, Any], kind: str, tail: float, what: 
         near(f"the bound of {name}", lower(k, n, tail), v["bound"], 1e-9)
     if v["holds"] and not (v["bound"] is not None and v["bound"] >= c["share"]):
         raise Rejected(f"certificate: {name} holds, but its bound is not the share that was asked.")
-    return f"{why}; its bound is that of its counts"
+    return f"{why}; its bound is that of its counts" if v["bound"] is not None else why
 
 
 def kind_of(name: str, asked: Any) -> str:

@@ -100,8 +100,8 @@ def cells(
     return found
 
 
-def bench(asked: Sequence[Cell], plan: Plan, out: Path) -> Iterator[tuple[Cell, dict[str, Any]]]:
-    """Each cell with its figures: those that `out` keeps, and else measured and kept.
+def bench(asked: Sequence[Cell], plan: Plan, out: Path) -> Iterator[dict[str, Any]]:
+    """A row for each cell, as in the CSV: what `out` keeps of it, and else measured and kept.
 
     Raises UserError where `out` cannot be written.
     """
@@ -117,29 +117,30 @@ def bench(asked: Sequence[Cell], plan: Plan, out: Path) -> Iterator[tuple[Cell, 
         if row is None:
             begin = time.monotonic()
             result = evaluate(cell.on, cell.made(cell.on), plan.episodes, plan.seed, beyond=0)
-            row = result.summary() | {"seconds": round(time.monotonic() - begin, 2)}
+            row = tidy(cell, result.summary(), round(time.monotonic() - begin, 2))
             file.parent.mkdir(parents=True, exist_ok=True)
             store.write_text_atomic(file, json.dumps({"asked": whole, "row": row}, indent=1) + "\n")
-        yield cell, row
+        yield row
 
 
 def kept(file: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
-    """The figures in a file, if it is whole and about the same question."""
+    """The row in a file, if it is whole and about the same question."""
     try:
         found = json.loads(file.read_text())
         same = json.dumps(found["asked"]) == json.dumps(asked)
-        return found["row"] if same else None
+        whole = [*found["row"]] == [*COLUMNS]
+        return found["row"] if same and whole else None
     except (OSError, ValueError, LookupError, TypeError):
         return None
 
 
 @cache
 def code() -> str:
-    """A hash of the code that decides a figure: games, controllers, and how they are played."""
+    """A hash of what decides a figure: games and their data, controllers, how they are played."""
     found = hashlib.sha256()
-    for folder in ("games", "tasks", "controllers", "simulation"):
-        for path in sorted((SOURCE / folder).rglob("*.py")):
-            found.update(path.read_bytes())
+    for folder in ("games", "tasks", "controllers", "nets", "simulation"):
+        for path in sorted((SOURCE / folder).rglob("*")):
+            found.update(path.read_bytes() if path.suffix in (".py", ".json") else b"")
     return found.hexdigest()
 
 
@@ -147,10 +148,10 @@ COLUMNS = ("game", "controller", "horizons", "steps", "episodes", "cost", "succe
 COLUMNS += ("failed", "median", "p95", "unit", "seconds")
 
 
-def tidy(cell: Cell, row: dict[str, Any]) -> dict[str, Any]:
-    """One line of the CSV."""
+def tidy(cell: Cell, row: dict[str, Any], seconds: float) -> dict[str, Any]:
+    """One line of the CSV, from the summary of an evaluation."""
     low, high = row["interval"]
     values = (cell.game, cell.controller, cell.horizons, cell.on.horizon, row["episodes"])
     values += (row["cost_mean"], row["success_rate"], low, high, row["failed"]["success_rate"])
     values += (row["final_distance"]["0.5"], row["final_distance"]["0.95"], row["unit"])
-    return dict(zip(COLUMNS, (*values, row["seconds"]), strict=True))
+    return dict(zip(COLUMNS, (*values, seconds), strict=True))
