@@ -27,6 +27,7 @@ FLOORS = """
     compute
     games
     tasks
+    hosts
     simulation
     nets
     controllers

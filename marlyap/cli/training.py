@@ -10,9 +10,12 @@ from pathlib import Path
 from marlyap.cli.common import Overrides, say
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
+from marlyap.hosts.opening import names_a_host
 from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.algorithms import PRESETS
-from marlyap.learning.trainer import Trainer, schedule_for
+from marlyap.learning.hosted import Hosted
+from marlyap.learning.trainers import ready, trainer_for, usual_schedule
+from marlyap.learning.training import AbstractTrainer
 from marlyap.runs import config
 from marlyap.runs.job import Launch
 from marlyap.runs.launch import launch
@@ -43,7 +46,7 @@ class Asked:
 
 def reopened(places: Iterable[Path], task: str | None, algorithm: str | None) -> list[Run]:
     """The runs to be resumed; `task` and `algorithm` name code of the user's own."""
-    game = config.load(task, AbstractGame) if task else None
+    game = config.load_task(task) if task else None
     rule = config.load(algorithm, AbstractAlgorithm) if algorithm else None
     runs = [Run.open(d, game, rule) for d in expand(places)]
     for run in runs:
@@ -57,7 +60,7 @@ def reopened(places: Iterable[Path], task: str | None, algorithm: str | None) ->
 def keeps(
     run: Run,
     named: dict[str, str | None],
-    game: AbstractGame | None,
+    game: AbstractGame | Hosted | None,
     rule: AbstractAlgorithm | None,
 ) -> None:
     """Raise UserError if another task or algorithm is named than the run was trained with."""
@@ -87,27 +90,33 @@ def create(
 ) -> list[Run]:
     """One new run for each seed, in `out` or in runs/TASK/ALGORITHM."""
     trainer = assemble(asked, overrides)
-    safe = lambda name: Path(name.rpartition(":")[2]).stem if ":" in name else name
-    out = out or Path("runs") / safe(asked.task) / safe(asked.algorithm)
+    out = out or Path("runs") / folder(asked.task) / folder(asked.algorithm)
     places = {seed: out / f"seed{seed}" for seed in seeds(words)}
     for place in places.values():
         Run.vacant(place, force)
     return [Run.create(p, trainer, seed, asked.names, force) for seed, p in places.items()]
 
 
-def assemble(asked: Asked, overrides: Overrides) -> Trainer:
+def folder(name: str) -> str:
+    """What the directory of a task or algorithm is called."""
+    if names_a_host(name):
+        return re.sub(r"[^\w.+-]+", "-", name)
+    return Path(name.rpartition(":")[2]).stem if ":" in name else name
+
+
+def assemble(asked: Asked, overrides: Overrides) -> AbstractTrainer:
     """Task, algorithm and schedule as asked for."""
     preset = asked.names["preset"]
     if preset not in PRESETS:
         raise UserError(f"preset: '{preset}' is unknown; {config.suggest(preset, PRESETS)}")
-    game = config.load(asked.task, AbstractGame)
+    game = config.load_task(asked.task)
     algorithm = PRESETS[preset](config.load(asked.algorithm, AbstractAlgorithm))
-    schedule = schedule_for(algorithm, preset)
+    schedule = usual_schedule(game, algorithm, preset)
     parts = {"task": game, "algorithm": algorithm, "schedule": schedule}
     parts = config.override_all(parts, overrides)
     if asked.steps is not None:
         parts["schedule"] = config.override(parts["schedule"], "steps", str(asked.steps))
-    return Trainer(parts["task"], parts["algorithm"], parts["schedule"])
+    return trainer_for(ready(parts["task"]), parts["algorithm"], parts["schedule"])
 
 
 def seeds(words: list[str]) -> list[int]:

@@ -2,13 +2,14 @@
 
 import abc
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from marlyap.compute.devices import gathered
+from marlyap.errors import UserError
 from marlyap.learning.health import Health
 from marlyap.learning.replay import Episode
 from marlyap.learning.schedule import Schedule
@@ -74,6 +75,16 @@ class AbstractAlgorithm(eqx.Module):
         self, learner: PyTree, play: Play, keys: KeyPair, decay: Scalar, watch: Watch = unwatched
     ) -> tuple[PyTree, Info]:
         """Play and learn once, with all learning rates multiplied by `decay`."""
+
+    def from_steps(self) -> Any:
+        """Itself as an `AbstractOffPolicy`, for games outside JAX, of which single steps are kept.
+
+        Raises UserError where it needs more than that.
+        """
+        raise UserError(
+            "algorithm: it needs a game in JAX or whole episodes; for a game outside JAX take one "
+            "that learns from single steps, such as masac or maddpg."
+        )
 
     def networks(self, learner: PyTree) -> PyTree:
         """The networks of a learner; the default is all of it."""

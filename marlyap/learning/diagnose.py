@@ -1,6 +1,7 @@
 """Where did numbers stop being finite? Asked afterwards, so that training pays nothing for it."""
 
 import re
+from typing import Protocol
 
 import equinox as eqx
 import jax
@@ -8,11 +9,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PyTree
 
-from marlyap.learning.trainer import Carry, Trainer
+from marlyap.learning.algorithm import AbstractAlgorithm, Info, Watch
+from marlyap.learning.training import Carry
 from marlyap.nets.nets import Actors
 
 
-def diagnose(trainer: Trainer, carry: Carry, iteration: int) -> str | None:
+class Iterates(Protocol):
+    """A training whose iterations can be played again."""
+
+    @property
+    def algorithm(self) -> AbstractAlgorithm: ...
+
+    @property
+    def agents(self) -> int: ...
+
+    def iterate(self, carry: Carry, watch: Watch) -> tuple[Carry, Info]: ...
+
+
+def diagnose(trainer: Iterates, carry: Carry, iteration: int) -> str | None:
     """Replay from `carry` until an iteration past which an array of the learner is not finite.
 
     Says which array, in which update, and of which agent where the actors have their own; None if
@@ -27,13 +41,13 @@ def diagnose(trainer: Trainer, carry: Carry, iteration: int) -> str | None:
             column = int(np.argmax(table[update] >= 0))
             networks = trainer.algorithm.networks(carry.learner)
             path, leaf = _numbers(networks)[column]
-            who = _agent(networks, trainer.game.agents, path, leaf, int(table[update, column]))
+            who = _agent(networks, trainer.agents, path, leaf, int(table[update, column]))
             return f"{_words(path)}{who} in update {update + 1} of iteration {now}"
     return None
 
 
 @eqx.filter_jit(donate="all-except-first")
-def _watched(trainer: Trainer, carry: Carry) -> tuple[Carry, list[Int[Array, "update"]]]:
+def _watched(trainer: Iterates, carry: Carry) -> tuple[Carry, list[Int[Array, "update"]]]:
     after, info = trainer.iterate(carry, first_faults)
     return after, info.seen
 

@@ -8,9 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from marlyap.errors import UserError
 from marlyap.learning.algorithm import AbstractFromData, Log, Watch, unwatched
 from marlyap.learning.health import Health
 from marlyap.learning.replay import Replay
+from marlyap.learning.source import CostWindow
+from marlyap.learning.steps import Steps
 from marlyap.simulation.rollout import Uniform
 from marlyap.types import Key, Scalar, Transition
 
@@ -22,7 +25,7 @@ class Learner(eqx.Module):
     """What an off-policy algorithm carries from one iteration to the next."""
 
     networks: PyTree
-    memory: Replay
+    memory: Replay | Steps
 
 
 class AbstractOffPolicy(AbstractFromData):
@@ -41,6 +44,14 @@ class AbstractOffPolicy(AbstractFromData):
 
     def networks(self, learner):
         return learner.networks
+
+    def from_steps(self):
+        if self.cost_window != CostWindow():
+            raise UserError(
+                "algorithm.constraint: it needs the costs of a game in JAX, and a game outside has "
+                "rewards alone; set it to none."
+            )
+        return self
 
     def updates_per_iteration(self, play):
         return play.schedule.updates(play.steps_per_iteration)
@@ -66,7 +77,7 @@ class AbstractOffPolicy(AbstractFromData):
     def improve(
         self,
         networks: PyTree,
-        memory: Replay,
+        memory: Replay | Steps,
         updates: int,
         key: Key,
         decay: Scalar,

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import singledispatch
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +27,14 @@ from marlyap.compute import export_cache
 from marlyap.conformance import shapes
 from marlyap.errors import UserError, defined_at
 from marlyap.games.game import AbstractGame
+from marlyap.hosts.opening import is_file, names_a_host
 from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.health import Health
+from marlyap.learning.hosted import Hosted
 from marlyap.learning.schedule import Schedule
 from marlyap.learning.source import shape
-from marlyap.learning.trainer import Carry, Trainer
+from marlyap.learning.trainers import trainer_for
+from marlyap.learning.training import AbstractTrainer, Carry
 from marlyap.nets.nets import LyapunovNet, NormNet
 from marlyap.runs import config
 from marlyap.simulation.rollout import Decentralised, Policy
@@ -45,7 +49,7 @@ class Run:
     """One training run on disk. Make it with `create` or `open`."""
 
     directory: Path
-    trainer: Trainer
+    trainer: AbstractTrainer
     seed: int
     names: dict[str, str]  # what the task and the algorithm were called
     warnings: tuple[str, ...] = ()  # what to tell whoever opens it
@@ -54,7 +58,7 @@ class Run:
     def create(
         cls,
         directory: Path | str,
-        trainer: Trainer,
+        trainer: AbstractTrainer,
         seed: int,
         names: dict[str, str],
         force: bool = False,
@@ -127,7 +131,7 @@ class Run:
     def open(
         cls,
         directory: Path | str,
-        game: AbstractGame | None = None,
+        game: AbstractGame | Hosted | None = None,
         algorithm: AbstractAlgorithm | None = None,
     ) -> "Run":
         """A run that exists; pass the task or algorithm if it is code of your own.
@@ -172,10 +176,12 @@ class Run:
                 what = f"the code in {now['source']} is not what {directory} was trained with"
                 warnings.append(f"{part}: {what}; it has changed since.")
             parts.append(made)
-        for part, family in zip(parts, (AbstractGame, AbstractAlgorithm, Schedule), strict=True):
+        families = (AbstractGame | Hosted, AbstractAlgorithm, Schedule)
+        for part, family in zip(parts, families, strict=True):
             if not isinstance(part, family):
                 raise UserError(f"run: {where} has a {type(part).__name__} in the wrong place.")
-        return cls(directory, Trainer(*parts), about["seed"], names, tuple(warnings))
+        permitted(parts[0], game)
+        return cls(directory, trainer_for(*parts), about["seed"], names, tuple(warnings))
 
     @property
     def untouched(self) -> bool:
@@ -185,7 +191,8 @@ class Run:
 
     @property
     def game(self) -> AbstractGame:
-        return self.trainer.game
+        """In JAX. Raises UserError where it is played outside."""
+        return self.trainer.model()
 
     @property
     def named(self) -> tuple[str, int]:
@@ -195,7 +202,8 @@ class Run:
     @property
     def labels(self) -> dict[str, str]:
         """`names` to be shown: of path/to/file.py:Name the Name alone."""
-        return {part: name.rpartition(":")[2] for part, name in self.names.items()}
+        short = lambda name: name if names_a_host(name) else name.rpartition(":")[2]
+        return {part: short(name) for part, name in self.names.items()}
 
     @property
     def title(self) -> str:
@@ -231,7 +239,8 @@ class Run:
         saved = self.checkpoints.latest()
         like, _ = eqx.filter_eval_shape(self.trainer.begin, jax.random.key(0))
         carry = unflatten(like, saved.arrays, str(self.directory))
-        return carry, float(saved.meta.get("seconds", 0.0)), saved.warnings
+        warnings = (*saved.warnings, *self.trainer.resumed())
+        return carry, float(saved.meta.get("seconds", 0.0)), warnings
 
     def deployed(self) -> tuple[Policy, LyapunovNet | NormNet | None]:
         """The policy that this run deploys, and its Lyapunov function if it has one."""
@@ -242,7 +251,7 @@ class Run:
         a = self.trainer.algorithm
 
         def made(key):
-            networks = a.init(shape(self.game), key)
+            networks = a.init(self.trainer.shape, key)
             return a.policy(networks), a.lyapunov(networks)
 
         like = eqx.filter_eval_shape(made, jax.random.key(0))
@@ -319,7 +328,7 @@ def _fits(policy: Policy, game: AbstractGame) -> bool:
     return action.shape == (game.agents, game.du)
 
 
-def begin(trainer: Trainer, seed: int) -> Carry:
+def begin(trainer: AbstractTrainer, seed: int) -> Carry:
     """The state of a fresh run. Raises UserError if what it began with was not played in numbers.
 
     In numbers: all are finite, and no cost is negative.
@@ -327,18 +336,36 @@ def begin(trainer: Trainer, seed: int) -> Carry:
     key = seeds.stream(seed, "train")
     like = lambda: eqx.filter_eval_shape(trainer.begin, key)[0]
     carry, health = export_cache.compiled(_begin, trainer, key, like)(key)
-    if fault := Health(**health).by_task(trainer.game.agents):
+    if fault := Health(**health).by_task(trainer.agents):
         when = f"in the warm-up (seed {seed})"
         raise UserError(f"{fault.says(when)} (check-task says more).")
     return carry
 
 
-def _begin(trainer: Trainer, key: jax.Array) -> tuple[Carry, dict[str, Any]]:
+def _begin(trainer: AbstractTrainer, key: jax.Array) -> tuple[Carry, dict[str, Any]]:
     carry, health = trainer.begin(key)
     return carry, health._asdict()
 
 
-def sound(game: AbstractGame) -> None:
+@singledispatch
+def permitted(game: AbstractGame | Hosted, given: AbstractGame | Hosted | None) -> None:
+    """Raise UserError where the game is a file that the user has not named.
+
+    What run.json says of code is never executed by itself.
+    """
+
+
+@permitted.register
+def _(game: Hosted, given: AbstractGame | Hosted | None) -> None:
+    named = given.source if isinstance(given, Hosted) else None
+    if is_file(game.source) and named != game.source:
+        raise UserError(
+            f"task: it is played by code of your own; name it with --task {game.source}."
+        )
+
+
+@singledispatch
+def sound(game: AbstractGame | Hosted) -> None:
     """Raise UserError for what a task returns in a wrong shape or type, or where it raises.
 
     Shapes alone are computed. `marlyap check-task` says more.
@@ -346,6 +373,11 @@ def sound(game: AbstractGame) -> None:
     for fault in shapes(game):
         place = defined_at(game, fault.partition(":")[0]) if " it raised " not in fault else None
         raise UserError(f"task: {f'{place}: ' if place else ''}{fault}")
+
+
+@sound.register
+def _(game: Hosted) -> None:
+    """Its sizes were read when it was opened, and each number is checked when it comes."""
 
 
 def expand(paths: Iterable[Path | str]) -> list[Path]:
