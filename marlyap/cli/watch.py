@@ -36,10 +36,15 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     from marlyap.report.gif import film_gif
     from marlyap.report.page import html
     from marlyap.runs import config, groups
+    from marlyap.runs.hosted import outside
     from marlyap.runs.run import one_run
     from marlyap.runs.subject import asked, subject
     from marlyap.storage import store
 
+    if outside([args.run]):
+        from marlyap.cli import hosted
+
+        return hosted.watch(args, overrides)
     starts = starts_of(args.seed)
     about = f"start {args.episode} of the held-out starts of seed {starts}"
     if names_a_controller(args.run):

@@ -122,7 +122,7 @@ class SideBySide(AbstractHostGame):
 
     def _step(self, i: int, action: Array) -> None:
         self.time[i] += 1
-        inputs = self.bounds(action)
+        inputs = [x.copy() for x in self.bounds(action)]  # an environment may write into them
         view = self._asked(i, lambda: self.games[i].step(inputs))
         reward, terminated, cut, active, success = (self.layout.parts[k] for k in (2, 3, 4, 5, 8))
         row = self.rows[i]

@@ -198,17 +198,17 @@ def installed(source: str, module: str, packages: str, extra: str) -> Any:
 
 
 def _vmas(source: str, copies: int, arguments: Arguments) -> AbstractHostGame:
-    installed(source, "vmas", "vmas", "")
+    library = installed(source, "vmas", "vmas", "")
     from marlyap.hosts.vmas import Vmas
 
-    return Vmas(source, copies, arguments)
+    return Vmas(library, source, copies, arguments)
 
 
 def _jaxmarl(source: str, copies: int, arguments: Arguments) -> AbstractHostGame:
-    installed(source, "jaxmarl", "jaxmarl", "")
+    library = installed(source, "jaxmarl", "jaxmarl", "")
     from marlyap.hosts.jaxmarl import JaxMarl
 
-    return JaxMarl(source, copies, arguments)
+    return JaxMarl(library, source, copies, arguments)
 
 
 ONE: dict[str, Maker] = {

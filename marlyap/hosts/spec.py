@@ -177,13 +177,13 @@ class Bounds:
                     f"task: agent {side.name} of {spec.source} has an action without bounds; wrap "
                     "the environment so that its actions lie in a finite box."
                 )
-        low = [np.asarray(side.low, np.float32) for side in spec.sides]
-        high = [np.asarray(side.high, np.float32) for side in spec.sides]
-        self.middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
-        self.half = [(b - a) / 2 for a, b in zip(low, high, strict=True)]
-        self.low, self.high = low, high
+        wide = lambda x: np.pad(np.asarray(x, np.float32), (0, spec.du - len(x)))
+        self.low = np.stack([wide(side.low) for side in spec.sides])
+        self.high = np.stack([wide(side.high) for side in spec.sides])
+        self.middle, self.half = (self.low + self.high) / 2, (self.high - self.low) / 2
+        self.sizes = [side.du for side in spec.sides]
 
     def __call__(self, action: Array) -> list[Array]:
-        """Of the rows [agent du], the numbers that each agent decides, in its own units."""
-        pairs = zip(action, self.middle, self.half, self.low, self.high, strict=True)
-        return [np.clip(m + h * a[: len(m)], lo, hi) for a, m, h, lo, hi in pairs]
+        """Of [*axes agent du], what each agent decides [*axes number], in its own units."""
+        scaled = np.clip(self.middle + self.half * action, self.low, self.high)
+        return [scaled[..., k, :size] for k, size in enumerate(self.sizes)]

@@ -1,7 +1,6 @@
 """Where did numbers stop being finite? Asked afterwards, so that training pays nothing for it."""
 
 import re
-from typing import Protocol
 
 import equinox as eqx
 import jax
@@ -9,24 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PyTree
 
-from marlyap.learning.algorithm import AbstractAlgorithm, Info, Watch
-from marlyap.learning.training import Carry
+from marlyap.learning.training import AbstractTrainer, Carry
 from marlyap.nets.nets import Actors
 
 
-class Iterates(Protocol):
-    """A training whose iterations can be played again."""
-
-    @property
-    def algorithm(self) -> AbstractAlgorithm: ...
-
-    @property
-    def agents(self) -> int: ...
-
-    def iterate(self, carry: Carry, watch: Watch) -> tuple[Carry, Info]: ...
-
-
-def diagnose(trainer: Iterates, carry: Carry, iteration: int) -> str | None:
+def diagnose(trainer: AbstractTrainer, carry: Carry, iteration: int) -> str | None:
     """Replay from `carry` until an iteration past which an array of the learner is not finite.
 
     Says which array, in which update, and of which agent where the actors have their own; None if
@@ -47,7 +33,7 @@ def diagnose(trainer: Iterates, carry: Carry, iteration: int) -> str | None:
 
 
 @eqx.filter_jit(donate="all-except-first")
-def _watched(trainer: Iterates, carry: Carry) -> tuple[Carry, list[Int[Array, "update"]]]:
+def _watched(trainer: AbstractTrainer, carry: Carry) -> tuple[Carry, list[Int[Array, "update"]]]:
     after, info = trainer.iterate(carry, first_faults)
     return after, info.seen
 

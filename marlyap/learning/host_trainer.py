@@ -1,7 +1,8 @@
 """Training on a game outside JAX: steps are played here and there, and learnt from inside jit."""
 
+import dataclasses
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -83,7 +84,7 @@ class HostTrainer(AbstractTrainer):
         needed = (self.warmup + self.iterations) * self.game.rollout
         rows = min(needed, max(self.schedule.capacity // n, self.game.rollout))
         networks = a.init(self.shape, k_learn)
-        memory = Steps.empty(jax.tree.map(jnp.asarray, self._blank(())), rows)
+        memory = Steps.empty(_stored(self.blank()), rows)
         none = jnp.full(LAST, jnp.nan)
         seed = jax.random.bits(k_play, (), jnp.uint32)
         played = Played(seed, jnp.zeros(n, int), none, none, jnp.asarray(0))
@@ -111,11 +112,11 @@ class HostTrainer(AbstractTrainer):
             table = Table(self, game, carry.played)
             if not afresh:
                 carry = self._warm(carry, table)
-            learn = None
+            learn, learns = None, self.algorithm.from_steps()
             while done < self.iterations and not stop():
                 done += 1
                 key, k_play, k_learn = jax.random.split(carry.key, 3)
-                explorer = self.algorithm.explore(self.algorithm.networks(carry.learner))
+                explorer = learns.explore(learns.networks(carry.learner))
                 new = table.play(explorer, k_play)
                 given = _placed((carry.learner, new, carry.iteration, k_learn))
                 learn = learn or self._compiled(given)
@@ -130,11 +131,13 @@ class HostTrainer(AbstractTrainer):
                 log = table.log() | info["log"] | ({"fresh_episodes": 1.0} if afresh else {})
                 afresh = False
                 log = {k: np.atleast_1d(np.asarray(v)) for k, v in log.items()}
-                health = {k: np.atleast_1d(np.asarray(v)) for k, v in info["health"].items()}
+                health = {k: jnp.atleast_1d(v) for k, v in info["health"].items()}
                 yield done, carry, Told(log, Health(**health))
 
     def _compiled(self, given: "Given") -> Callable[["Given"], tuple[Learner, dict[str, Any]]]:
-        return export_cache.compiled(_learn, self, given, lambda: given[0], donate=True)
+        game = dataclasses.replace(self.game, workers=0)  # not to compile for each number of them
+        maker = dataclasses.replace(self, game=game)
+        return export_cache.compiled(_learn, maker, given, lambda: given[0], donate=True)
 
     def _warm(self, carry: Carry, table: "Table") -> Carry:
         """Remember random steps before learning begins."""
@@ -157,21 +160,15 @@ class HostTrainer(AbstractTrainer):
         where = lambda c: (c.best, c.score)
         return eqx.tree_at(where, carry, (policy, jnp.asarray(score, jnp.float32)))
 
-    def _blank(self, time: tuple[int, ...]) -> Stored:
-        """A step of all copies, all zeros; `time` is a leading axis."""
-        shape, n = self.shape, self.copies
-        room = lambda *size, kind=np.float32: np.zeros((*time, n, *size), kind)
-        agents, obs, du = shape.agents, shape.obs, shape.du
-        seen = lambda: (room(agents, obs), room(agents, self.game.parts))
-        return Stored(
-            *seen(),
-            room(agents, du),
-            room(agents),
-            room(agents),
-            *seen(),
-            room(agents, kind=bool),
-            room(kind=bool),
-        )
+    def blank(self, *time: int) -> dict[str, np.ndarray]:
+        """The arrays of a `Stored` of all copies, all zeros; `time` are leading axes."""
+        shape, axes = self.shape, (*time, self.copies)
+        each = (*axes, shape.agents)
+        sizes = {"obs": shape.obs, "state": self.game.parts, "action": shape.du}
+        sizes |= {"next_obs": shape.obs, "next_state": self.game.parts}
+        room = {name: np.zeros((*each, size), np.float32) for name, size in sizes.items()}
+        room |= {name: np.zeros(each, np.float32) for name in ("log_prob", "reward")}
+        return room | {"alive": np.zeros(each, bool), "ended": np.zeros(axes, bool)}
 
 
 class Table:
@@ -190,19 +187,19 @@ class Table:
 
     def play(self, explorer: AbstractExplorer, key: Any) -> Stored:
         """`rollout` steps of every copy, with leading axes [time, copy]."""
-        new = self.trainer._blank((self.hosted.rollout,))
-        act = self.act.by(explorer, key)
+        new = self.trainer.blank(self.hosted.rollout)
+        act, rows = self.act.by(explorer, key), self.hosted.rows
         for t in range(self.hosted.rollout):
             action, log_prob = act(self.obs, t)
             step = self.game.step(action)
-            rows = self.hosted.rows
-            new.obs[t], new.state[t] = self.obs, rows(self.state)
-            new.action[t], new.log_prob[t], new.reward[t] = action, log_prob, step.reward
-            new.next_obs[t], new.next_state[t] = step.final_obs, rows(step.final_state)
-            new.alive[t], new.ended[t] = step.active & ~step.terminated, step.ended
+            told = {"obs": self.obs, "state": rows(self.state), "action": action}
+            told |= {"log_prob": log_prob, "reward": step.reward, "ended": step.ended}
+            told |= {"next_obs": step.final_obs, "next_state": rows(step.final_state)}
+            for name, value in (told | {"alive": step.active & ~step.terminated}).items():
+                new[name][t] = value
             self.obs, self.state = step.obs, step.state
             self._count(step.reward, step.ended, step.success)
-        return new
+        return _stored(new)
 
     def _count(self, reward: np.ndarray, ended: np.ndarray, success: np.ndarray) -> None:
         """Returns and successes of the episodes that ended."""
@@ -232,6 +229,10 @@ class Table:
         if np.isfinite(self.successes).any():
             told["success"] = float(np.nanmean(self.successes))
         return told
+
+
+def _stored(arrays: Mapping[str, np.ndarray]) -> Stored:
+    return Stored(**{name: jnp.asarray(x) for name, x in arrays.items()})
 
 
 class Actor:

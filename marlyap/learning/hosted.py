@@ -3,12 +3,35 @@
 import dataclasses
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from marlyap.errors import UserError, check_range
 from marlyap.hosts.opening import open_game, parsed
 from marlyap.hosts.spec import AbstractHostGame, Spec
 from marlyap.nets.nets import Shape
+from marlyap.simulation.rollout import Policy, act_alone
+
+
+class HostPolicy(eqx.Module):
+    """A policy for a game outside JAX, to be called wherever the agents are."""
+
+    policy: Policy
+    game: "Hosted"
+
+    def __call__(self, obs: Float[np.ndarray, "agent obs"]) -> Float[Array, "agent du"]:
+        """What all agents do, in [-1, 1]; rows of small agents are padded with zeros."""
+        return self.policy(jnp.asarray(obs, jnp.float32), jax.random.key(0))
+
+    def agent(self, agent: int, obs: Float[np.ndarray, "own"]) -> Float[Array, "du"]:
+        """What one agent does at its own observation alone, in [-1, 1], without padding.
+
+        Raises UserError for an agent that there is not, or a policy that sees what others observe.
+        """
+        row = jnp.zeros(max(self.game.observed)).at[: len(obs)].set(jnp.asarray(obs, jnp.float32))
+        return act_alone(self.policy, self.game.agents, agent, row)[: self.game.decided[agent]]
 
 
 class Hosted(eqx.Module):
@@ -73,6 +96,14 @@ class Hosted(eqx.Module):
                 f"{self.observed} and {self.decided}; use the versions that run.json names."
             )
         return game
+
+    def filmed(self) -> AbstractHostGame:
+        """One copy in this process that draws its frames. Raises UserError where it cannot."""
+        here = dataclasses.replace(self, workers=0)
+        try:
+            return here.open(1, render_mode="rgb_array")
+        except UserError as error:
+            raise UserError(f"{str(error).rstrip('.')}, asked to draw (render_mode).") from error
 
     def opened(self) -> "Hosted":
         """The same with the sizes that it has."""

@@ -11,9 +11,8 @@ from jaxtyping import PyTree
 from marlyap.errors import UserError
 from marlyap.learning.algorithm import AbstractFromData, Log, Watch, unwatched
 from marlyap.learning.health import Health
-from marlyap.learning.replay import Replay
+from marlyap.learning.replay import AbstractMemory, Replay
 from marlyap.learning.source import CostWindow
-from marlyap.learning.steps import Steps
 from marlyap.simulation.rollout import Uniform
 from marlyap.types import Key, Scalar, Transition
 
@@ -25,7 +24,7 @@ class Learner(eqx.Module):
     """What an off-policy algorithm carries from one iteration to the next."""
 
     networks: PyTree
-    memory: Replay | Steps
+    memory: AbstractMemory
 
 
 class AbstractOffPolicy(AbstractFromData):
@@ -77,7 +76,7 @@ class AbstractOffPolicy(AbstractFromData):
     def improve(
         self,
         networks: PyTree,
-        memory: Replay | Steps,
+        memory: AbstractMemory,
         updates: int,
         key: Key,
         decay: Scalar,

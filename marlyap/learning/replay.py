@@ -4,7 +4,9 @@ Whole episodes are kept because next_obs of one step is obs of the following one
 memory), and because n-step returns need the steps that follow.
 """
 
+import abc
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -33,7 +35,19 @@ class Episode(eqx.Module):
         return math.prod(self.terminated.shape)
 
 
-class Replay(eqx.Module):
+class AbstractMemory(eqx.Module):
+    """What may be drawn from: whole episodes, or single steps."""
+
+    @abc.abstractmethod
+    def add(self, new: Any) -> Any:
+        """With what was just played; the oldest is overwritten."""
+
+    @abc.abstractmethod
+    def sample(self, key: Key, batch: int, gamma: float, n: int = 1) -> Transition:
+        """`batch` transitions with n-step rewards, each step equally likely."""
+
+
+class Replay(AbstractMemory):
     """The last `rows` episodes."""
 
     episodes: Episode  # every leaf has a leading axis `rows`

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from marlyap.learning.replay import AbstractMemory
 from marlyap.types import Key, Transition
 
 
@@ -25,7 +26,7 @@ class Stored(eqx.Module):
     ended: Bool[Array, "*axes"]  # the episode ended or was cut with this step
 
 
-class Steps(eqx.Module):
+class Steps(AbstractMemory):
     """The last `rows` steps of every copy."""
 
     kept: Stored  # every leaf has leading axes [row, copy]

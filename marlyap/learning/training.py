@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PyTree
 
+from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
-from marlyap.learning.algorithm import AbstractAlgorithm
+from marlyap.learning.algorithm import AbstractAlgorithm, Info, Watch, unwatched
 from marlyap.learning.health import Health
 from marlyap.learning.schedule import Schedule
 from marlyap.nets.nets import Shape
@@ -85,6 +86,13 @@ class AbstractTrainer(eqx.Module):
         The arrays of `carry` have a leading axis of runs where there are several; those of `Told`
         always have it. The carry that goes in is used up.
         """
+
+    def iterate(self, carry: Carry, watch: Watch = unwatched) -> tuple[Carry, Info]:
+        """One iteration; `watch` is asked about the networks after each update.
+
+        Runs inside jit. Raises UserError where the game is played outside JAX.
+        """
+        raise UserError(f"task: iterations on a {type(self.game).__name__} do not run inside jit.")
 
     @abc.abstractmethod
     def model(self) -> AbstractGame:

@@ -100,8 +100,7 @@ class Actors(eqx.Module):
 
     net: MLP  # leaves have a leading axis `agent`, or `kind`; none where all share
     shared: bool | tuple[int, ...]  # the kind of each agent where those of one kind share
-    du: int
-    inputs: tuple[int, ...]  # of each agent: its actions beyond so many are 0; (): none is
+    du: int | tuple[int, ...]  # actions of every agent, or of each: those beyond them are 0
 
     def __init__(self, shape: Shape, width: int, shared: bool = False, *, key: Key):
         make = lambda k: MLP((shape.obs, width, width, 2 * shape.du), key=k)
@@ -111,7 +110,7 @@ class Actors(eqx.Module):
             self.net = several(1 + max(self.shared))
         else:
             self.net = make(key) if shared else several(shape.agents)
-        self.du, self.inputs = shape.du, shape.inputs
+        self.du = shape.inputs or shape.du
 
     @property
     def each(self) -> MLP:
@@ -124,7 +123,7 @@ class Actors(eqx.Module):
         """tanh(mean + std * noise) for standard normal noise: reparametrised."""
         per_agent = _squashed_rows if self.shared is True else eqx.filter_vmap(_squashed)
         column = lambda x: x[..., None]
-        masks = (column(self.mask),) if self.inputs else ()
+        masks = (column(mask),) if (mask := self.mask) is not None else ()
         out = per_agent(self.each, (column(obs), column(noise), column(memory), *masks))
         return Sample(out[0][..., 0], out[1][..., 0, 0], out[2][..., 0, 0])
 
@@ -135,13 +134,20 @@ class Actors(eqx.Module):
         return self.within(jnp.tanh(mean))
 
     @property
-    def mask(self) -> Action:
+    def width(self) -> int:
+        """Actions in a row: of the agent that has most."""
+        return self.du if isinstance(self.du, int) else max(self.du)
+
+    @property
+    def mask(self) -> Action | None:
         """1 where an action counts, 0 where it is there because another agent has more."""
-        return jnp.asarray([[float(k < n) for k in range(self.du)] for n in self.inputs])
+        if isinstance(self.du, int):
+            return None
+        return jnp.asarray([[float(k < n) for k in range(self.width)] for n in self.du])
 
     def within(self, action: Action) -> Action:
         """The same, 0 where it does not count."""
-        return action * self.mask if self.inputs else action
+        return action if (mask := self.mask) is None else action * mask
 
 
 def _squash(net: MLP, x: tuple[Array, ...]) -> tuple[Array, Array, Array]:
@@ -178,7 +184,7 @@ class Sampled(AbstractExplorer):
     pi: Actors
 
     def __call__(self, obs: Obs, key: Key) -> Action:
-        noise = jax.random.normal(key, (obs.shape[0], self.pi.du))
+        noise = jax.random.normal(key, (obs.shape[0], self.pi.width))
         return self.pi.sample(obs, noise, noise).action
 
     def log_prob(self, obs: Obs, action: Action) -> Float[Array, "agent"]:

@@ -30,7 +30,7 @@ from marlyap.games.game import AbstractGame
 from marlyap.hosts.opening import is_file, names_a_host
 from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.health import Health
-from marlyap.learning.hosted import Hosted
+from marlyap.learning.hosted import Hosted, HostPolicy
 from marlyap.learning.schedule import Schedule
 from marlyap.learning.source import shape
 from marlyap.learning.trainers import trainer_for
@@ -291,20 +291,36 @@ class Run:
         store.write_text_atomic(self.directory / "log.jsonl", text)
 
 
-def load_policy(directory: Path | str, task: AbstractGame | str | None = None) -> Decentralised:
+def load_policy(
+    directory: Path | str, task: AbstractGame | str | None = None
+) -> Decentralised | HostPolicy:
     """The policy that a run deploys, ready to act.
 
     Arguments: directory, of the run; task, the run's task where it is code of your own: the object,
     or path/to/file.py:Name, which is executed.
 
-    `load_policy(...).policy(obs, key)` takes what the agents observe [agent, obs] and gives actions
-    [agent, input] in [-1, 1]; times `game.plant.limits` they are inputs in their units. Row i
-    follows from row i alone, and what `obs` holds is told by `game.entries()`. Called with a State
-    and a key it is a controller of the run's game.
+    `load_policy(...).agent(i, obs)` is what agent i does at its own observation [obs] alone:
+    numbers in [-1, 1]; times `game.plant.limits` they are inputs in their units.
+    `load_policy(...).policy(obs, key)` takes what all agents observe [agent, obs] and gives actions
+    [agent, input]. Row i follows from row i alone, and what `obs` holds is told by
+    `game.entries()`. Called with a State and a key it is a controller of the run's game; the policy
+    of a game outside JAX is called with what all agents observe.
     Raises UserError if the directory is no run, has no policy yet, or needs `task`.
     """
-    game = config.load(task, AbstractGame) if isinstance(task, str) else task
-    return Run.open(directory, game).controller()
+    game = config.load_task(task) if isinstance(task, str) else task
+    run = Run.open(directory, game)
+    return acting(run.trainer.game, run)
+
+
+@singledispatch
+def acting(game: AbstractGame, run: Run) -> Decentralised | HostPolicy:
+    """The run's policy as what acts in this kind of game."""
+    return run.controller()
+
+
+@acting.register
+def _(game: Hosted, run: Run) -> Decentralised | HostPolicy:
+    return HostPolicy(run.deployed()[0], game)
 
 
 def _recorded(code: Any, part: str, where: str, own: Iterable[str]) -> dict[str, Any]:
@@ -365,7 +381,7 @@ def _(game: Hosted, given: AbstractGame | Hosted | None) -> None:
 
 
 @singledispatch
-def sound(game: AbstractGame | Hosted) -> None:
+def sound(game: AbstractGame) -> None:
     """Raise UserError for what a task returns in a wrong shape or type, or where it raises.
 
     Shapes alone are computed. `marlyap check-task` says more.
