@@ -36,6 +36,9 @@ FLOORS = """
     conformance
     runs
     report
+    outside
+    pettingzoo
+    gymnasium
     cli
     __main__
 """.split()

@@ -1,6 +1,7 @@
 """Copies of an environment that knows of one episode at a time, side by side in this process."""
 
 import abc
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -18,6 +19,9 @@ from marlyap.hosts.spec import (
     episode_seed,
     fault,
 )
+
+
+NOT_FINITE = "the {} holds a number that is not finite"
 
 
 class View(NamedTuple):
@@ -66,7 +70,7 @@ class SideBySide(AbstractHostGame):
 
     def __init__(self, make: Callable[[], AbstractEnvironment], copies: int, first: int = 0):
         self.games = [make() for _ in range(copies)]
-        self.first, self.numbers = first, range(first, first + copies)
+        self.numbers, self.names = range(first, first + copies), self.spec.names
         self.layout, self.bounds = Layout(self.spec), Bounds(self.spec)
         self.rows = np.zeros((copies, self.layout.size), np.float32)
         self.seed, self.episode, self.time = 0, [0] * copies, [0] * copies
@@ -99,8 +103,9 @@ class SideBySide(AbstractHostGame):
 
     def each(self, action: Array) -> Iterator[Array]:
         """As `step`, one copy after the other; yields the row of each."""
+        inputs = [x.copy() for x in self.bounds(action)]  # an environment may write into them
         for i in range(len(self.games)):
-            self._step(i, action[i])
+            self._step(i, [x[i] for x in inputs])
             yield self.rows[i]
 
     def frame(self):
@@ -120,9 +125,8 @@ class SideBySide(AbstractHostGame):
         obs = self._asked(i, lambda: self.games[i].reset(seed))
         self._observe(i, obs, 0, [True] * self.spec.agents)
 
-    def _step(self, i: int, action: Array) -> None:
+    def _step(self, i: int, inputs: Sequence[Array]) -> None:
         self.time[i] += 1
-        inputs = [x.copy() for x in self.bounds(action)]  # an environment may write into them
         view = self._asked(i, lambda: self.games[i].step(inputs))
         reward, terminated, cut, active, success = (self.layout.parts[k] for k in (2, 3, 4, 5, 8))
         row = self.rows[i]
@@ -155,25 +159,32 @@ class SideBySide(AbstractHostGame):
 
     def _observe(self, i: int, obs: Sequence[Any], part: int, there: Sequence[bool]) -> None:
         """Observations and state into the row, from part number `part` on."""
-        wide = np.zeros((self.spec.agents, self.spec.obs), np.float32)
-        for k, side in enumerate(self.spec.sides):
+        row, spec = self.rows[i], self.layout.spec
+        wide = row[self.layout.parts[part]].reshape(spec.agents, spec.obs)
+        wide[:] = 0.0
+        for k, side in enumerate(spec.sides):
             if there[k]:
                 wide[k, : side.obs] = self._numbers(i, obs[k], side.obs, "observation", side.name)
-        self.rows[i][self.layout.parts[part]] = wide.ravel()
-        if self.spec.state:
-            state = self._asked(i, self.games[i].state)
-            self.rows[i][self.layout.parts[part + 1]] = self._numbers(
-                i, state, self.spec.state, "state", ""
-            )
+        if not np.isfinite(wide).all():
+            k = int(np.argmin(np.isfinite(wide).all(axis=1)))
+            raise self._fault(i, NOT_FINITE.format("observation"), spec.names[k])
+        if spec.state:
+            state = self._numbers(i, self._asked(i, self.games[i].state), spec.state, "state", "")
+            if not np.isfinite(state).all():
+                raise self._fault(i, NOT_FINITE.format("state"))
+            row[self.layout.parts[part + 1]] = state
 
     def _rewards(self, i: int, view: View) -> list[float]:
         found = []
-        for side, reward in zip(self.spec.sides, view.reward, strict=True):
-            found.append(float(self._numbers(i, reward, 1, "reward", side.name)[0]))
+        for name, reward in zip(self.names, view.reward, strict=True):
+            number = float(self._numbers(i, reward, 1, "reward", name)[0])
+            if not math.isfinite(number):
+                raise self._fault(i, NOT_FINITE.format("reward"), name)
+            found.append(number)
         return found
 
     def _numbers(self, i: int, value: Any, size: int, what: str, agent: str) -> Array:
-        """The value as so many finite numbers."""
+        """The value as so many numbers."""
         try:
             numbers = np.asarray(value, np.float32).ravel()
         except (TypeError, ValueError):
@@ -182,8 +193,6 @@ class SideBySide(AbstractHostGame):
         if numbers.size != size:
             shape = np.shape(value)
             raise self._fault(i, f"the {what} has shape {shape} and not {size} numbers", agent)
-        if not np.isfinite(numbers).all():
-            raise self._fault(i, f"the {what} holds a number that is not finite", agent)
         return numbers
 
     def _fault(self, i: int, what: str, agent: str = "") -> Fault:

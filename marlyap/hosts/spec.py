@@ -148,7 +148,7 @@ class Layout:
         sizes = [n * o, s, n, n, 1, n, n * o, s, 1]
         ends = np.cumsum(sizes)
         self.parts = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
-        self.size, self.agents, self.obs = int(ends[-1]), n, o
+        self.spec, self.size, self.agents, self.obs = spec, int(ends[-1]), n, o
 
     def read(self, rows: Array) -> Step:
         """The step that the rows [copy number] tell."""

@@ -110,7 +110,8 @@ class _Process:
             bufsize=0,
         )
         assert self.process.stdin is not None and self.process.stdout is not None
-        self.orders, self.answers = self.process.stdin, self.process.stdout.fileno()
+        self.orders, self.stream = self.process.stdin, self.process.stdout
+        self.answers = self.stream.fileno()
         self.held = b""
         self.say(json.dumps(about).encode() + b"\n")
 
@@ -173,6 +174,5 @@ class _Process:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
-        with suppress(OSError):
-            os.close(self.answers)
+        self.stream.close()
         self.errors.close()
