@@ -20,7 +20,7 @@ from marlyap.runs import config
 from marlyap.runs.job import Launch
 from marlyap.runs.launch import launch
 from marlyap.runs.progress import show
-from marlyap.runs.run import Run, expand
+from marlyap.runs.run import Run, expand, one_run
 from marlyap.runs.stop import Stop
 from marlyap.runs.subject import supplies
 
@@ -95,6 +95,23 @@ def create(
     for place in places.values():
         Run.vacant(place, force)
     return [Run.create(p, trainer, seed, asked.names, force) for seed, p in places.items()]
+
+
+def start_from(runs: list[Run], place: Path, task: str, algorithm: str) -> None:
+    """Give new runs the networks of the run at this place; what does not fit leaves none of them.
+
+    Task and algorithm are what the user named for the new runs: they supply the code of his own.
+    """
+    try:
+        other = Run.open(
+            one_run(place), config.load_task(task), config.load(algorithm, AbstractAlgorithm)
+        )
+        for run in runs:
+            run.started_from(other)
+    except BaseException:
+        for run in runs:
+            shutil.rmtree(run.directory, ignore_errors=True)
+        raise
 
 
 def folder(name: str) -> str:

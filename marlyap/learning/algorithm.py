@@ -90,6 +90,14 @@ class AbstractAlgorithm(eqx.Module):
         """The networks of a learner; the default is all of it."""
         return learner
 
+    def with_networks(self, learner: PyTree, networks: PyTree) -> PyTree:
+        """The learner with other networks in it."""
+        return networks
+
+    def with_room(self, learner: PyTree, like: PyTree) -> PyTree:
+        """The learner with as much room to remember as `like` has, for a longer run."""
+        return learner
+
     @abc.abstractmethod
     def policy(self, networks: PyTree) -> Policy:
         """The deterministic policy that is evaluated, certified and deployed."""

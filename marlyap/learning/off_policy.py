@@ -44,6 +44,12 @@ class AbstractOffPolicy(AbstractFromData):
     def networks(self, learner):
         return learner.networks
 
+    def with_networks(self, learner, networks):
+        return Learner(networks, learner.memory)
+
+    def with_room(self, learner, like):
+        return Learner(learner.networks, learner.memory.resized(like.memory))
+
     def from_steps(self):
         if self.cost_window != CostWindow():
             raise UserError(

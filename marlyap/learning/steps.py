@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from marlyap.learning.replay import AbstractMemory
+from marlyap.learning.replay import AbstractMemory, regrown
 from marlyap.types import Key, Transition
 
 
@@ -61,6 +61,9 @@ class Steps(AbstractMemory):
         noise = jnp.moveaxis(jax.random.normal(k_noise, (agents, 2, du, batch)), -1, 0)
         take = lambda age, copy, noise: self.transition(age, copy, noise, gamma, n)
         return jax.vmap(take)(age, copy, noise)
+
+    def resized(self, like: "Steps") -> "Steps":
+        return Steps(*regrown(self.kept, like.kept, self.head, self.size))
 
     def transition(
         self,

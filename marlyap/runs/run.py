@@ -6,6 +6,7 @@ checkpoints/    the whole learner, replay memory and random keys included; the l
 policy/         the best policy so far, and the Lyapunov function: what is evaluated and deployed
 """
 
+import dataclasses
 import json
 import shutil
 import time
@@ -241,6 +242,44 @@ class Run:
         carry = unflatten(like, saved.arrays, str(self.directory))
         warnings = (*saved.warnings, *self.trainer.resumed())
         return carry, float(saved.meta.get("seconds", 0.0)), warnings
+
+    def lengthened(self, steps: int) -> "Run":
+        """The same run with a schedule of so many environment steps, to be resumed.
+
+        From here on the learning rates are those of the longer schedule at this place.
+        Raises UserError if it is not longer than what has been done.
+        """
+        if steps <= self.steps_done:
+            raise UserError(
+                f"steps: {self.directory} has done {self.steps_done} already; take more."
+            )
+        schedule = dataclasses.replace(self.trainer.schedule, steps=steps)
+        longer = dataclasses.replace(self.trainer, schedule=schedule)
+        with store.lock(self.directory):
+            if self.checkpoints.steps():
+                carry, seconds, _ = self.load()
+                like, _ = eqx.filter_eval_shape(longer.begin, jax.random.key(0))
+                learner = longer.algorithm.with_room(carry.learner, like.learner)
+                carry = eqx.tree_at(lambda c: c.learner, carry, learner)
+                saved = {"seconds": seconds}
+                self.checkpoints.save(int(carry.iteration), flatten(carry), saved)
+            about = store.read_json(self.directory / "run.json")
+            about["schedule"] = config.record(schedule)
+            text = json.dumps(about, indent=1) + "\n"
+            store.write_text_atomic(self.directory / "run.json", text)
+        return dataclasses.replace(self, trainer=longer)
+
+    def started_from(self, other: "Run") -> None:
+        """Begin with the networks of another run, their optimisers and its policy; memory is fresh.
+
+        Raises UserError where they do not fit.
+        """
+        a, carry = self.trainer.algorithm, begin(self.trainer, self.seed)
+        learnt = other.trainer.algorithm.networks(other.load()[0].learner)
+        networks = unflatten(a.networks(carry.learner), flatten(learnt), str(other.directory))
+        learner = a.with_networks(carry.learner, networks)
+        where = lambda c: (c.learner, c.best)
+        self.save(eqx.tree_at(where, carry, (learner, a.policy(networks))), 0.0)
 
     def deployed(self) -> tuple[Policy, LyapunovNet | NormNet | None]:
         """The policy that this run deploys, and its Lyapunov function if it has one."""
