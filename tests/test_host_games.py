@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from marlyap.errors import UserError
-from marlyap.hosts.opening import open_game, parsed
+from marlyap.hosts.opening import open_game
+from marlyap.hosts.sources import parsed
 from marlyap.hosts.spec import Fault, episode_seed
 
 

@@ -299,3 +299,44 @@ def test_python(run):
     team = np.asarray(policy(obs))
     assert team.shape == (2, 3)
     np.testing.assert_allclose(policy.agent(0, obs[0]), team[0, :1], rtol=1e-6)
+
+
+# ---- from another run, and longer ----
+
+QUICK = """--schedule.environments 4 --schedule.warmup 160 --schedule.select_episodes 4
+--algorithm.actor_width 8 --algorithm.critic_width 8 --algorithm.batch 16""".split()
+
+
+@pytest.mark.slow
+def test_a_run_is_made_longer_and_begins_from_another(tmp_path, capsys):
+    first, second = tmp_path / "first", tmp_path / "second"
+    train = ["train", "rendezvous", "masac", *QUICK]
+    assert main([*train, "--steps", "320", "--out", str(first)]) == 0
+    before = Run.open(first / "seed0").load()[0]
+    rows, head = before.learner.memory.rows, int(before.learner.memory.head)
+    assert "take more" in refused(capsys, "train", "--resume", first / "seed0", "--steps", "320")
+    longer = Run.open(first / "seed0").lengthened(640)
+    after = longer.load()[0]
+    assert after.learner.memory.rows > rows and not longer.finished
+    old, new = (c.learner.memory.episodes.obs for c in (before, after))
+    order = (np.arange(rows) + head) % rows
+    np.testing.assert_array_equal(np.asarray(old)[order], np.asarray(new)[:rows])
+    assert main(["train", "--resume", str(first / "seed0")]) == 0
+    assert Run.open(first / "seed0").finished
+
+    words = [*train, "--steps", "160", "--out", str(second), "--from", str(first / "seed0")]
+    learnt = Run.open(first / "seed0").load()[0].learner.networks
+    assert main(words) == 0
+    carry = Run.open(second / "seed0").load()[0]
+    moved = [
+        float(np.abs(a - b).max())
+        for a, b in zip(
+            jax.tree.leaves(eqx.filter(learnt.pi.value, eqx.is_array)),
+            jax.tree.leaves(eqx.filter(carry.learner.networks.pi.value, eqx.is_array)),
+            strict=True,
+        )
+    ]
+    assert 0 < max(moved) < 0.05  # a few updates away
+    other = ["train", "formation", "masac", *QUICK, "--out", tmp_path / "third"]
+    refused(capsys, *other, "--from", first / "seed0")
+    assert not (tmp_path / "third" / "seed0").exists()

@@ -13,9 +13,7 @@ from marlyap.cli.common import Overrides, Result, say, starts_of
 from marlyap.errors import UserError
 from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.report.data import MARK
-from marlyap.report.hosted import film, gather_hosted, words
-from marlyap.report.page import html
-from marlyap.report.png import learning_curves_png
+from marlyap.report.hosted import gather_hosted, words
 from marlyap.runs import config
 from marlyap.runs.hosted import evaluate_hosted, frames
 from marlyap.runs.run import Run, expand, one_run
@@ -42,6 +40,10 @@ def evaluate(args: Namespace, overrides: Overrides) -> Result:
 
 def report(args: Namespace, overrides: Overrides) -> Result:
     """One page about the runs: curves and figures, and a film beside it where one can be made."""
+    from marlyap.report.gif import frames_gif
+    from marlyap.report.page import html
+    from marlyap.report.png import learning_curves_png
+
     runs, seed = opened(args.runs, args, overrides), starts_of(args.seed)
     default = runs[0].directory / "report.html" if len(runs) == 1 else Path("report.html")
     out = args.out or default
@@ -53,7 +55,7 @@ def report(args: Namespace, overrides: Overrides) -> Result:
     pictures = [out.with_name(f"{out.stem}-learning.png")]
     learning_curves_png(page.runs, pictures[0])
     try:
-        film(frames(runs[0], seed), out.with_name(f"{out.stem}-film.gif"))
+        frames_gif(frames(runs[0], seed), out.with_name(f"{out.stem}-film.gif"))
         pictures.append(out.with_name(f"{out.stem}-film.gif"))
     except UserError as error:
         say(f"There is no film: {error}")
@@ -66,12 +68,14 @@ def report(args: Namespace, overrides: Overrides) -> Result:
 
 def watch(args: Namespace, overrides: Overrides) -> Result:
     """One episode as the environment draws it, as a GIF."""
+    from marlyap.report.gif import frames_gif
+
     run = opened([one_run(Path(args.run))], args, overrides)[0]
     place, seed = args.out or run.directory, starts_of(args.seed)
     if not place.is_dir():
         raise UserError(f"out: there is no directory {place}.")
     gif = place / "film.gif"
-    film(frames(run, seed, args.episode), gif)
+    frames_gif(frames(run, seed, args.episode), gif)
     say(f"Film: {gif.resolve()}")
     return {"gif": str(gif), "start_seed": seed}, 0
 

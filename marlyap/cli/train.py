@@ -18,7 +18,7 @@ EXAMPLES = """
   marlyap train platoon.py:Platoon apg
   marlyap train --resume runs/rendezvous/masac-lyapunov/seed0
   marlyap train --resume runs/rendezvous/masac/seed0 --steps 500000
-  marlyap train rendezvous-late masac --from runs/rendezvous/masac/seed0
+  marlyap train rendezvous-rest masac --from runs/rendezvous/masac/seed0
   marlyap train pettingzoo:mpe2.simple_spread_v3 masac --task.workers 2"""
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from marlyap.cli.common import Overrides, say
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
-from marlyap.hosts.opening import names_a_host
+from marlyap.hosts.sources import names_a_host
 from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.algorithms import PRESETS
 from marlyap.learning.hosted import Hosted

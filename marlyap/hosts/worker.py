@@ -14,7 +14,7 @@ import numpy as np
 
 from marlyap.errors import UserError
 from marlyap.hosts.copies import SideBySide
-from marlyap.hosts.opening import maker
+from marlyap.hosts.sources import maker
 
 
 RESET, STEP, ROW, REFUSED = b"r", b"s", b".", b"!"

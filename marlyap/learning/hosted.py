@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from marlyap.errors import UserError, check_range
-from marlyap.hosts.opening import open_game, parsed
+from marlyap.hosts.opening import open_game
+from marlyap.hosts.sources import parsed
 from marlyap.hosts.spec import AbstractHostGame, Spec
 from marlyap.nets.nets import Shape
 from marlyap.simulation.rollout import Policy, act_alone

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,6 @@ from marlyap.runs import config
 from marlyap.runs.run import Run
 from marlyap.storage import store
 from marlyap.storage.hashing import policy_hash
-
-
-MOST_FRAMES = 150
 
 
 def gather_hosted(
@@ -86,15 +82,3 @@ def words(found: Sequence[Mapping[str, Any]]) -> str:
         f"return {np.mean(means):.2f} over {len(means)} training seeds "
         f"({min(means):.2f} to {max(means):.2f}), {each} episodes each"
     )
-
-
-def film(frames: Sequence[np.ndarray], path: Path, fps: float = 10) -> None:
-    """The environment's own frames as an animated GIF."""
-    from PIL import Image
-
-    step = -(-len(frames) // MOST_FRAMES)
-    images = [Image.fromarray(np.ascontiguousarray(f)) for f in frames[::step]]
-    write = lambda file: images[0].save(
-        file, "GIF", save_all=True, append_images=images[1:], duration=int(1000 / fps), loop=0
-    )
-    store.write_bytes_atomic(path, write)

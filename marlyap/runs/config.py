@@ -25,7 +25,7 @@ from marlyap.controllers import CONTROLLERS, AbstractController
 from marlyap.errors import UserError, first_line, raised_at, whole
 from marlyap.games.dynamics import DYNAMICS, AbstractDynamics
 from marlyap.games.game import AbstractGame
-from marlyap.hosts.opening import is_file, names_a_host
+from marlyap.hosts.sources import is_file, names_a_host
 from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.algorithms import ALGORITHMS
 from marlyap.learning.constraint import AbstractConstraint

@@ -28,7 +28,7 @@ from marlyap.compute import export_cache
 from marlyap.conformance import shapes
 from marlyap.errors import UserError, defined_at
 from marlyap.games.game import AbstractGame
-from marlyap.hosts.opening import is_file, names_a_host
+from marlyap.hosts.sources import is_file, names_a_host
 from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.health import Health
 from marlyap.learning.hosted import Hosted, HostPolicy
