@@ -63,11 +63,9 @@ class MarlyapEnv(ParallelEnv):
         self.state_space = bound(self.team.size)
         self.draws = np.random.default_rng()
 
-    @functools.cache  # noqa: B019 (the same object for the same agent, as PettingZoo asks)
     def observation_space(self, agent: str) -> spaces.Space:
         return self.observation_spaces[agent]
 
-    @functools.cache  # noqa: B019
     def action_space(self, agent: str) -> spaces.Space:
         return self.action_spaces[agent]
 
@@ -78,7 +76,7 @@ class MarlyapEnv(ParallelEnv):
         obs = self.team.reset(int(self.draws.integers(2**31)))
         return self._each(obs), {a: {} for a in self.agents}
 
-    def step(self, actions: dict[str, Any]):
+    def step(self, actions: dict[str, Any]) -> tuple[Any, Any, Any, Any, Any]:
         self.time += 1
         given = np.stack([np.asarray(actions[a], np.float32) for a in self.agents])
         told = self.team.step(given)
@@ -128,4 +126,4 @@ def register() -> None:
     for name in TASKS:
         for kind, maker in (("parallel", parallel_env), ("aec", env)):
             made = functools.partial(maker, name)
-            registered(kind, f"marlyap/{name}-v0", made)  # pyright: ignore[reportArgumentType]
+            registered(kind, f"marlyap/{name}-v0", made)  # pyright: ignore

@@ -13,6 +13,7 @@ from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.algorithms import ALGORITHMS, MASAC, PRESETS, DecentralisedSAC
 from marlyap.learning.constraint import Unconstrained
 from marlyap.learning.constraints import CONSTRAINTS, Lyapunov
+from marlyap.learning.hosted import Hosted
 from marlyap.learning.trainer import SCHEDULES, Schedule, Trainer
 from marlyap.runs import config
 from marlyap.runs.run import Run
