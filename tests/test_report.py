@@ -195,7 +195,7 @@ def full_page(runs: int = 5, films: int = 3) -> Page:
         slices=(part(level=0.5),),
         notes=("runs/a: log.jsonl is cut off",),
         changed=("algorithm.constraint.beta",),
-        differing=(Difference("masac-lyapunov", "constraint.beta=0.5"),),
+        differing=(Difference("constraint.beta", ("0.5",)),),
         training=(
             Training(
                 name="seed 0",
@@ -398,7 +398,7 @@ def test_hostile_text_is_harmless():
                 versions={HOSTILE: HOSTILE},
             ),
         ),
-        differing=(Difference(HOSTILE, HOSTILE),),
+        differing=(Difference(HOSTILE, (HOSTILE,)),),
         config={HOSTILE: {HOSTILE: HOSTILE}},
         changed=(f"{HOSTILE}.{HOSTILE}",),
         versions={HOSTILE: HOSTILE},
@@ -491,7 +491,7 @@ def test_only_the_title_is_needed():
         films=(Film(frames=Frames(times=np.zeros(1), positions=np.zeros((1, 1, 2)))),),
         comparisons=(Comparison(),),
         claims=(Claim(),),
-        differing=(Difference("", ""),),
+        differing=(Difference("", ()),),
         training=(Training(),),
         config={"a": {}},
     )

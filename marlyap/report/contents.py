@@ -5,11 +5,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from marlyap.certificates.certificate import percent
 from marlyap.certificates.lyapunov import CostSum
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame, regulated
 from marlyap.report.changes import changed_fields, command_of, common
+from marlyap.report.charts import along
 from marlyap.report.data import (
     Claim,
     Comparison,
@@ -24,9 +27,11 @@ from marlyap.report.data import (
     Training,
     Within,
 )
-from marlyap.report.episodes import films, worst_case
+from marlyap.report.episodes import costs, worst_case
+from marlyap.report.filming import Lead, filmed
 from marlyap.report.slices import slices
 from marlyap.runs import groups
+from marlyap.runs.config import record
 from marlyap.runs.run import Run
 from marlyap.simulation.evaluation import evaluate
 from marlyap.storage import store
@@ -48,11 +53,13 @@ def gather(
     command: str = "",
     games: Sequence[AbstractGame] | None = None,
     called: str = "",
+    beside: str = "",
 ) -> Page:
     """Everything that a report shows of these runs.
 
     `games` has the game that each is measured on, by default its own, and `called` is the name of
-    that game where it is not the one that a run was trained on.
+    that game where it is not the one that a run was trained on. `beside` names the hand-written
+    controller that is filmed beside them (`filming.filmed`).
     """
     found = []
     for run, game in zip(runs, games or [run.game for run in runs], strict=True):
@@ -65,10 +72,16 @@ def gather(
     whose = lambda m: "" if alone else of[m.name][1]
     certified = [certificates(of[m.name][0], m.game, whose(m)) for m in found]
     shown = [claim for c in certified for claim in c.claims]
-    teams = [_group(name, members, bool(shown)) for name, members in team_of.items()]
-    leads = [members[0] for members in team_of.values()][:MOST_FILMED]
-    filmed = [shot for m in leads for shot in films(of[m.name][0], m, whose(m))]
-    apart = groups.differing([members[0].configuration for members in team_of.values()])
+    places = game_names([(*of[m.name], m) for m in found], called)
+    strips = {
+        m.name: costs(m.game, of[m.name][0].controller(m.game), seed, episodes) for m in found
+    }
+    told = lambda those: _more(those, places[those[0].name], strips)
+    teams = [_group(name, those, bool(shown), told(those)) for name, those in team_of.items()]
+    firsts = [those[0] for those in team_of.values()][:MOST_FILMED]
+    named = lambda m: of[m.name][0].labels["algorithm"] if alone else of[m.name][1]
+    leads = [Lead(of[m.name][0], m, named(m)) for m in firsts]
+    apart = groups.side_by_side([those[0].configuration for those in team_of.values()])
     notes = [
         note
         for m, c in zip(found, certified, strict=True)
@@ -81,11 +94,11 @@ def gather(
         starts=seed,
         groups=tuple(teams),
         runs=tuple(
-            _trained(of[m.name][0], m, of[m.name][1], name)
+            _trained(of[m.name][0], m, of[m.name][1], name, told([m]))
             for name, members in team_of.items()
             for m in members
         ),
-        films=(*filmed, *(shot for c in certified for shot in c.films)),
+        films=(*filmed(leads, beside), *(shot for c in certified for shot in c.films)),
         comparisons=tuple(
             Comparison(of[p["a"]][1], of[p["b"]][1], p["only_a"], p["only_b"], p["p_value"])
             for p in groups.comparisons(found)[:MOST_COMPARED]
@@ -95,15 +108,29 @@ def gather(
         notes=tuple(notes),
         config=common([m.configuration for m in found]),
         changed=tuple(sorted({name for run in runs for name in changed_fields(run)})),
-        differing=tuple(
-            Difference(name, fields)
-            for name, fields in zip(team_of, apart, strict=True)
-            if len(team_of) > 1
-        ),
+        differing=tuple(Difference(name, values) for name, values in apart),
         training=tuple(_training(run, label) for run, label in of.values()),
         versions=store.versions(),
         command=command,
     )
+
+
+def game_names(found: Sequence[tuple[Run, str, groups.Measured]], called: str) -> dict[str, str]:
+    """What to call the game of each measured run: its task, and what differs where that is shared."""
+    tasks = [called or run.labels["task"] for run, _, _ in found]
+    names = groups.named(
+        [(task, {"task": record(m.game)}) for task, (_, _, m) in zip(tasks, found, strict=True)]
+    )
+    return {m.name: name for name, (_, _, m) in zip(names, found, strict=True)}
+
+
+def _more(
+    those: Sequence[groups.Measured], game: str, strips: Mapping[str, np.ndarray]
+) -> dict[str, Any]:
+    """What the charts need of runs that belong together beside their figures."""
+    finals = np.concatenate([m.evaluation.final for m in those])
+    strip = along(np.concatenate([strips[m.name] for m in those]), those[0].game.dt)
+    return {"game": game, "finals": tuple(finals.tolist()), "along": strip}
 
 
 def figures(summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -118,14 +145,18 @@ def _about_share(part: Mapping[str, Any]) -> dict[str, Any]:
     return {name: part[name] for name in ("episodes", "successes", "success_rate", "interval")}
 
 
-def _group(label: str, members: Sequence[groups.Measured], certified: bool) -> Group:
+def _group(
+    label: str, members: Sequence[groups.Measured], certified: bool, more: Mapping[str, Any]
+) -> Group:
     """What is said of runs that belong together."""
     said = groups.summary(members)
     text = _caveat(said["about"], certified)
-    return Group(label=label, text=text, **figures(said))
+    return Group(label=label, text=text, **figures(said), **more)
 
 
-def _trained(run: Run, measured: groups.Measured, label: str, group: str) -> Trained:
+def _trained(
+    run: Run, measured: groups.Measured, label: str, group: str, more: Mapping[str, Any]
+) -> Trained:
     """One run, what its evaluation found and what its log says."""
     log = tuple(
         LogRow(line["steps"], line.get("success"), line.get("return"))
@@ -133,7 +164,8 @@ def _trained(run: Run, measured: groups.Measured, label: str, group: str) -> Tra
         if "steps" in line
     )
     said = figures(measured.evaluation.summary())
-    return Trained(name=measured.name, label=label, group=group, seed=run.seed, log=log, **said)
+    about = {"name": measured.name, "label": label, "group": group, "seed": run.seed}
+    return Trained(**about, log=log, **said, **more)
 
 
 def _title(runs: Sequence[Run], found: Sequence[groups.Measured]) -> str:
@@ -248,12 +280,14 @@ def certificates(run: Run, game: AbstractGame, label: str) -> Certified:
         V = CostSum(controller=controller, T=meta["V"]["T"], ball=meta["V"]["ball"])
     worst: dict[tuple[str, int], list[str]] = {}
     for name, verdict in meta["verdicts"].items():
-        case = verdict["worst"] or {}
-        if {"purpose", "episode"} <= {*case} and "change" not in case:
-            worst.setdefault((case["purpose"], case["episode"]), []).append(name)
+        if (case := _worst(verdict)) is not None:
+            worst.setdefault(case, []).append(name)
+    named = lambda case: "" if case is None else f"worst case {run.directory} {case[0]} {case[1]}"
     level = meta["verdicts"].get("basin", {}).get("figures", {}).get("level")
     return Certified(
-        claims=tuple(_claim(name, v, label) for name, v in meta["verdicts"].items()),
+        claims=tuple(
+            _claim(name, v, label, named(_worst(v))) for name, v in meta["verdicts"].items()
+        ),
         films=tuple(
             worst_case(
                 there,
@@ -262,7 +296,8 @@ def certificates(run: Run, game: AbstractGame, label: str) -> Certified:
                 meta["seed"],
                 *case,
                 label=f"worst for {', '.join(names)}",
-                run=label,
+                run=label or run.labels["algorithm"],
+                shot=named(case),
             )
             for case, names in worst.items()
         ),
@@ -270,14 +305,22 @@ def certificates(run: Run, game: AbstractGame, label: str) -> Certified:
     )
 
 
-def _claim(name: str, verdict: Mapping[str, Any], run: str) -> Claim:
-    """A verdict as it is shown."""
+def _worst(verdict: Mapping[str, Any]) -> tuple[str, int] | None:
+    """The start of the worst case of a verdict, if it can be played again."""
+    case = verdict["worst"] or {}
+    known = {"purpose", "episode"} <= {*case} and "change" not in case
+    return (case["purpose"], case["episode"]) if known else None
+
+
+def _claim(name: str, verdict: Mapping[str, Any], run: str, shot: str) -> Claim:
+    """A verdict as it is shown; `shot` is the film of its worst case."""
     known = {k.replace("_", " "): v for k, v in verdict["scope"].items() if v is not None}
     said = {k: verdict[k] for k in ("claim", "evidence", "holds", "bound", "confidence")}
     asked, bound = verdict["figures"].get("share_asked"), verdict["bound"]
     return Claim(
         name=name,
         run=run,
+        shot=shot,
         asked=asked,
         shown=None if asked is None or bound is None else percent(bound),
         scope=", ".join(f"{k}: {v}" for k, v in known.items()),

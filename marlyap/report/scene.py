@@ -24,6 +24,7 @@ PAPER, INK, SOFT, RULE, FAINT = "#ffffff", "#1c1d20", "#5e6169", "#dddcd6", "#ec
 TRAIL = 1.5  # s, for which a body's trail is drawn strongly
 RISE = 1e-3  # of the largest value: a smaller rise is not marked
 MOST_STRIPS = 8
+MOST_PLAYED = 300  # times of a film in the page; of a longer one every so many are left out
 
 
 def ink(number: int) -> str:
@@ -107,6 +108,20 @@ class Scene:
         return " · ".join(parts)
 
     @property
+    def who(self) -> str:
+        """Who drives."""
+        return self.film.run or self.film.label
+
+    @property
+    def ended(self) -> str:
+        """How it ended, in a few words."""
+        film, end = self.film, {None: "", True: "success", False: "failure"}[self.film.success]
+        far = ""
+        if film.distance is not None:
+            far = f"final distance {decimal(film.distance[-1], 3, film.unit)}"
+        return " · ".join(part for part in (end, far) if part)
+
+    @property
     def outcome(self) -> str:
         """Whose episode it is, where that is said, and how it went."""
         end = {None: "", True: "success", False: "failure"}[self.film.success]
@@ -155,6 +170,54 @@ def scenes(films: Sequence[Film]) -> list[Scene]:
     if len(flat) < len(made) or not sides or max(sides) > 2.5 * min(sides):
         return made
     return [framed(scene, max(sides)) for scene in made]
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """Films of one start, which can be seen side by side."""
+
+    label: str
+    scenes: tuple[Scene, ...]
+
+    @property
+    def told(self) -> str:
+        """The start, and how the first of them ended."""
+        first = self.scenes[0]
+        start = f"start {first.film.start}" if first.film.start else ""
+        many = f"{len(self.scenes)} controllers" if len(self.scenes) > 1 else ""
+        return " · ".join(part for part in (start, many or first.film.run, first.ended) if part)
+
+
+def shots(films: Sequence[Film]) -> list[Shot]:
+    """Films by their start, those of one start drawn to one scale."""
+    groups: dict[str, list[Scene]] = {}
+    for k, scene in enumerate(scenes(films)):
+        groups.setdefault(scene.film.shot or f"alone {k}", []).append(scene)
+    return [
+        Shot(those[0].film.title or those[0].label, aligned(those)) for those in groups.values()
+    ]
+
+
+def aligned(those: Sequence[Scene]) -> tuple[Scene, ...]:
+    """Scenes with the same windows and the same ranges of their strips, where they are alike."""
+    if len({len(scene.panels) for scene in those}) > 1:
+        return tuple(those)
+    windows = []
+    for same in zip(*(scene.panels for scene in those), strict=True):
+        low, high = (pick([p.window for p in same], axis=0) for pick in (np.min, np.max))
+        windows.append((float(low[0]), float(high[1]), float(low[2]), float(high[3])))
+    spans: dict[str, tuple[float, float]] = {}
+    for strip in (strip for scene in those for strip in scene.strips):
+        low, high = spans.get(strip.name, strip.span)
+        spans[strip.name] = (min(low, strip.span[0]), max(high, strip.span[1]))
+    return tuple(
+        replace(
+            scene,
+            panels=tuple(replace(p, window=w) for p, w in zip(scene.panels, windows, strict=True)),
+            strips=tuple(replace(strip, span=spans[strip.name]) for strip in scene.strips),
+        )
+        for scene in those
+    )
 
 
 def framed(scene: Scene, side: float, centre: tuple[float, float] | None = None) -> Scene:
@@ -275,28 +338,33 @@ def _over(a: float, b: float) -> float:
 
 def played(scene: Scene) -> dict[str, Any]:
     """What the player of the page reads: numbers, rounded, with None for what is not finite."""
+    stride = -(-len(scene.times) // MOST_PLAYED)
     moving = not np.array_equal(scene.goals, np.broadcast_to(scene.goals[:1], scene.goals.shape))
+    links = scene.film.frames.links
     return {
         "label": scene.label,
-        "dt": scene.dt,
-        "steps": len(scene.times),
+        "who": scene.who,
+        "ended": scene.ended,
+        "dt": scene.dt * stride,
+        "steps": len(scene.times[::stride]),
         "radius": scene.edge,
         "unit": scene.film.frames.unit,
-        "goals": plain(scene.goals if moving else scene.goals[:1]),
-        "positions": plain(scene.places),
-        "headings": None if scene.angles is None else plain(scene.angles, 3),
+        "goals": plain(scene.goals[::stride] if moving else scene.goals[:1]),
+        "positions": plain(scene.places[::stride]),
+        "headings": None if scene.angles is None else plain(scene.angles[::stride], 3),
         "leaders": scene.leaders,
         "rods": scene.film.frames.rods,
         "tints": scene.tints,
-        "edges": scene.film.frames.links or ((),),
+        "edges": (links[::stride] if len(links) > 1 else links) or ((),),
         "panels": [vars(panel) for panel in scene.panels],
-        "strips": [vars(strip) | {"lines": _rounded(strip)} for strip in scene.strips],
+        "strips": [vars(strip) | {"lines": _rounded(strip, stride)} for strip in scene.strips],
     }
 
 
-def _rounded(strip: Strip) -> list[list[Number]]:
+def _rounded(strip: Strip, stride: int) -> list[list[Number]]:
     """Four digits: of each value where the axis begins at 0, else of the axis."""
     low, high = strip.span
+    lines = strip.lines[:, ::stride]
     if not low:
-        return plain(strip.lines, significant=True)
-    return plain(strip.lines, 4 - math.floor(math.log10(high - low)))
+        return plain(lines, significant=True)
+    return plain(lines, 4 - math.floor(math.log10(high - low)))
