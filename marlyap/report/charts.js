@@ -12,8 +12,8 @@
     const style = getComputedStyle(document.documentElement);
     const read = (name) => style.getPropertyValue("--" + name).trim();
     for (const figure of figures.values()) {
-      for (const { tags, glyph, hover_glyph } of figure.renderers) {
-        const tint = tags[2];
+      for (const { glyph, hover_glyph } of figure.renderers) {
+        const tint = glyph.tags[2];
         if (tint === -2) continue; // the ground of level sets
         const colour = read(tint < 0 ? "ink" : "c" + tint);
         for (const part of [glyph, hover_glyph]) {
@@ -34,7 +34,7 @@
   function show() {
     for (const figure of figures.values()) {
       for (const renderer of figure.renderers) {
-        const [team, member] = renderer.tags;
+        const [team, member] = renderer.glyph.tags;
         if (team >= 0) renderer.visible = !off.team.has(team) && !off.member.has(member);
       }
     }
@@ -93,7 +93,6 @@
 
   // ---- begin ----
 
-  Bokeh.set_log_level("warn");
   Bokeh.embed.embed_items(documents, items).then(() => {
     const elements = items[0].roots, roots = Bokeh.documents[0].roots();
     for (const root of roots) {

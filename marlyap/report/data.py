@@ -172,11 +172,12 @@ class Film:
     unit: str = ""  # of distance and edge
     level: np.ndarray | None = None  # [time]: a Lyapunov function, or the cost
     level_name: str = ""
+    cost: np.ndarray | None = None  # [time], where the level is another
     rises: bool = False  # whether the level should fall, so that its rises are marked
     success: bool | None = None
 
     def __post_init__(self):
-        for name in ("distance", "level"):
+        for name in ("distance", "level", "cost"):
             if (value := getattr(self, name)) is not None:
                 array, time = np.asarray(value, float), len(self.frames.times)
                 if array.shape != (time,):

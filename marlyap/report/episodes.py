@@ -120,6 +120,7 @@ def film(
         distance=np.asarray(jax.vmap(game.distance)(state)).max(axis=1),
         edge=game.edge,
         unit=game.unit,
+        cost=None if lyapunov is None else cost,
         level=cost if lyapunov is None else np.asarray(lyapunov),
         level_name="cost" if lyapunov is None else function,
         rises=lyapunov is not None,

@@ -1,4 +1,4 @@
-"""Which episodes a report films: for every game a few starts, each driven by several controllers."""
+"""Which episodes a report films: a few starts of every game, each driven by several controllers."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -2,7 +2,7 @@
 
 `embedded` makes one JSON document of all charts of a page; its library is `library()`, from the
 package. Colours of the frame come from the page's style (`--bk-...`), those of the curves are set
-by `charts.js` when the theme changes. Each renderer carries `[group, run, colour]` as its tags.
+by `charts.js` when the theme changes. Each glyph carries `[group, run, colour]` as its tags.
 """
 
 import json
@@ -19,6 +19,7 @@ from bokeh.models import (
     ColumnDataSource,
     HoverTool,
     LogColorMapper,
+    LogTicker,
     NumeralTickFormatter,
     PanTool,
     ResetTool,
@@ -71,14 +72,19 @@ def embedded(charts: Sequence[Chart], slices: Sequence[Slice]) -> Embedded:
 
 def _chart(chart: Chart) -> Any:
     kinds = {"x_axis_type": "log"} if chart.log_x else {}
-    shown = _frame(chart.x_label, chart.y_label, x_range=_room(chart), **kinds)
+    low, high = chart.y_span
+    room = 0.04 * (high - low or 1.0)
+    ranges = {"x_range": _room(chart), "y_range": (low - room, high + room)}
+    shown = _frame(chart.x_label, chart.y_label, **ranges, **kinds)
     points = [_line(shown, line) for line in chart.lines]
     far = "@x{0,0.####}" if not chart.log_x else "@x{0.0000}"
     tips = [("", "$name"), (chart.x_label, far), (chart.y_label, "@y{0,0.[000]}")]
     if any(line.low is not None for line in chart.lines):
         tips.append(("band", "@low{0,0.[000]} – @high{0,0.[000]}"))
     shown.add_tools(HoverTool(renderers=points, tooltips=tips))
-    if not chart.log_x:
+    if chart.log_x:
+        shown.xaxis.ticker = LogTicker(desired_num_ticks=4, mantissas=[1, 2, 5])
+    else:
         shown.xaxis.formatter = NumeralTickFormatter(format="0.[00]a")
     return shown
 
@@ -100,6 +106,7 @@ def _frame(x_label: str, y_label: str, **more: Any) -> Any:
         y_axis_label=y_label,
         tools=[zoom, wheel, pan, ResetTool()],
         active_drag=zoom,
+        active_scroll=None,
         toolbar_location=None,
         background_fill_color=None,
         border_fill_color=None,

@@ -50,6 +50,11 @@
     return power * [1, 2, 5, 10].find((m) => m * power >= 0.8 * span / about);
   }
 
+  function write(pen, text, x, y) { // readable across a line
+    pen.strokeStyle = colours.raised; pen.lineWidth = 3;
+    pen.strokeText(text, x, y); pen.fillText(text, x, y);
+  }
+
   // ---- one film: its scene and its strips ----
 
   const MARGIN = 48, ROW = 84;
@@ -119,19 +124,19 @@
     }
 
     function drawGrid(pen, panel, width, height, [x0, y0], [across, up]) {
-      const step = roundStep((panel.lanes ? width : Math.min(width, scene.clientHeight)) / across, 5), digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+      const step = roundStep((panel.lanes ? width : Math.min(width, scene.clientHeight)) / across, Math.max(2, Math.min(5, width / 75))), digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
       const unit = film.unit && " " + film.unit, label = (value) => (Math.abs(value) < step / 2 ? 0 : value).toFixed(digits).replace("-", "\u2212") + unit;
       pen.fillStyle = colours.soft;
       for (let k = Math.ceil((x0 - width / 2 / across) / step); k * step < x0 + width / 2 / across; k++) {
         const x = Math.round(width / 2 + (k * step - x0) * across) + 0.5;
         drawLine(pen, colours.faint, x, 0, x, height);
-        if (x > 30 && x < width - 30) pen.fillText(label(k * step), x + 4, height - 6);
+        if (x > 30 && x < width - 30) write(pen, label(k * step), x + 4, height - 6);
       }
       const rows = panel.lanes ? 1 : step;
       for (let k = Math.ceil((y0 - height / 2 / up) / rows); k * rows < y0 + height / 2 / up; k++) {
         const y = Math.round(height / 2 - (k * rows - y0) * up) + 0.5;
         drawLine(pen, colours.faint, 0, y, width, y);
-        if (y > 12 && y < height - 20) pen.fillText(panel.lanes ? -k : label(k * step), 5, y - 4);
+        if (y > 12 && y < height - 20) write(pen, panel.lanes ? -k : label(k * step), 5, y - 4);
       }
       if (film.panels.length > 1) pen.fillText(panel.labels[1], width - 40, 14);
     }
@@ -263,7 +268,7 @@
       const [, name, unit] = row.name.match(/^(.*?)(?: \(([^)]*)\))?$/);
       return [(n || panes.length === 1 ? " · " : " ") + name + " ", bold(say(row.lines[0][k]) + (unit && !row.rises ? " " + unit : ""))];
     });
-    return panes.length > 1 ? [" | " + film.who + ":", ...values] : values;
+    return panes.length > 1 ? ["\n" + film.who + ":", ...values] : values;
   }
 
   function fitPace() { // in real time unless that would be over in a blink or take minutes

@@ -202,10 +202,7 @@ def aligned(those: Sequence[Scene]) -> tuple[Scene, ...]:
     """Scenes with the same windows and the same ranges of their strips, where they are alike."""
     if len({len(scene.panels) for scene in those}) > 1:
         return tuple(those)
-    windows = []
-    for same in zip(*(scene.panels for scene in those), strict=True):
-        low, high = (pick([p.window for p in same], axis=0) for pick in (np.min, np.max))
-        windows.append((float(low[0]), float(high[1]), float(low[2]), float(high[3])))
+    windows = [_around(same) for same in zip(*(scene.panels for scene in those), strict=True)]
     spans: dict[str, tuple[float, float]] = {}
     for strip in (strip for scene in those for strip in scene.strips):
         low, high = spans.get(strip.name, strip.span)
@@ -220,10 +217,20 @@ def aligned(those: Sequence[Scene]) -> tuple[Scene, ...]:
     )
 
 
-def framed(scene: Scene, side: float, centre: tuple[float, float] | None = None) -> Scene:
+def _around(panels: Sequence[Panel]) -> tuple[float, float, float, float]:
+    """A window that shows all of several; square where each of them is."""
+    low, high = (pick([panel.window for panel in panels], axis=0) for pick in (np.min, np.max))
+    left, right, bottom, top = (float(v) for v in (low[0], high[1], low[2], high[3]))
+    if any(panel.lanes or abs(panel.height - 1) > 1e-6 for panel in panels):
+        return left, right, bottom, top
+    half, x, y = max(right - left, top - bottom) / 2, (left + right) / 2, (bottom + top) / 2
+    return x - half, x + half, y - half, y + half
+
+
+def framed(scene: Scene, side: float) -> Scene:
     """A scene in the plane, shown in a square of this side."""
     left, right, bottom, top = scene.panels[0].window
-    x, y = centre or ((left + right) / 2, (bottom + top) / 2)
+    x, y = (left + right) / 2, (bottom + top) / 2
     window = x - side / 2, x + side / 2, y - side / 2, y + side / 2
     return replace(scene, panels=(replace(scene.panels[0], window=window),))
 
@@ -296,6 +303,8 @@ def _strips(film: Film) -> tuple[Strip, ...]:
         name = f"largest distance ({film.unit})" if film.unit else "largest distance"
         most = _span(np.append(film.distance, film.edge or 0.0))
         made.append(Strip(name, film.distance[None], most, mark=film.edge))
+    if film.cost is not None:
+        made.append(Strip("cost", film.cost[None], _span(film.cost)))
     for name, values in frames.signals.items():
         made.append(Strip(name, values.T, _span(values, zero=False), agents=True))
     return tuple(made[:MOST_STRIPS])
