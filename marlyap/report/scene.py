@@ -199,7 +199,7 @@ def shots(films: Sequence[Film]) -> list[Shot]:
 
 
 def aligned(those: Sequence[Scene]) -> tuple[Scene, ...]:
-    """Scenes with the same windows and the same ranges of their strips, where they are alike."""
+    """Scenes with the same windows, and their strips at one scale, those that all have first."""
     if len({len(scene.panels) for scene in those}) > 1:
         return tuple(those)
     windows = [_around(same) for same in zip(*(scene.panels for scene in those), strict=True)]
@@ -207,11 +207,13 @@ def aligned(those: Sequence[Scene]) -> tuple[Scene, ...]:
     for strip in (strip for scene in those for strip in scene.strips):
         low, high = spans.get(strip.name, strip.span)
         spans[strip.name] = (min(low, strip.span[0]), max(high, strip.span[1]))
+    shared = set.intersection(*({strip.name for strip in scene.strips} for scene in those))
+    in_order = lambda scene: sorted(scene.strips, key=lambda strip: strip.name not in shared)
     return tuple(
         replace(
             scene,
             panels=tuple(replace(p, window=w) for p, w in zip(scene.panels, windows, strict=True)),
-            strips=tuple(replace(strip, span=spans[strip.name]) for strip in scene.strips),
+            strips=tuple(replace(strip, span=spans[strip.name]) for strip in in_order(scene)),
         )
         for scene in those
     )
