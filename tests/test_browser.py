@@ -222,6 +222,7 @@ def test_a_certificate_shows_its_worst_case(page):
     assert kinds == ["statistical", "proved", "observed"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", SIZES)
 def test_everyone_can_read_it(browser, file, size, scheme):
@@ -237,6 +238,7 @@ def test_everyone_can_read_it(browser, file, size, scheme):
         assert faults == []
 
 
+@pytest.mark.slow
 def test_curves_follow_the_theme(browser, file):
     colour = "marlyapCharts.figures.get('chart-0').renderers[0].glyph.line_color.value"
     seen = []

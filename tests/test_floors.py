@@ -142,7 +142,9 @@ def test_only_pictures_import_matplotlib(file):
     names = ("bench", "gif", "interactive", "mp4", "page", "paper", "plot", "png")
     drawing = {f"marlyap.report.{name}" for name in names}
     if module(file) not in drawing:
-        assert not {name for name in imported(file) if name.split(".")[0] in ("matplotlib", "PIL", "bokeh")}
+        assert not {
+            name for name in imported(file) if name.split(".")[0] in ("matplotlib", "PIL", "bokeh")
+        }
         first = [node for node in TREES[file].body if isinstance(node, ast.Import | ast.ImportFrom)]
         assert not imported(file, ast.Module(first, [])) & drawing, "import it where one draws"
     text = file.read_text()

@@ -236,7 +236,9 @@ def embedded(text: str) -> list:
 
 def drawn(text: str) -> str:
     """The charts that Bokeh reads; NaN or Infinity in them is an error."""
-    found = re.search(r'<script type="application/json" id="charts">(.*?)</script>', text, re.DOTALL)
+    found = re.search(
+        r'<script type="application/json" id="charts">(.*?)</script>', text, re.DOTALL
+    )
     assert found
     return json.dumps(json.loads(found[1], parse_constant=pytest.fail))
 

@@ -16,13 +16,18 @@ import numpy as np
 from bokeh.document import Document
 from bokeh.models import (
     BoxZoomTool,
+    CDSView,
     ColumnDataSource,
+    GlyphRenderer,
     HoverTool,
+    Line as Curve,
     LogColorMapper,
     LogTicker,
     NumeralTickFormatter,
     PanTool,
     ResetTool,
+    Scatter,
+    VArea,
     WheelZoomTool,
 )
 from bokeh.plotting import figure
@@ -59,9 +64,10 @@ def embedded(charts: Sequence[Chart], slices: Sequence[Slice]) -> Embedded:
     document, roots = Document(), {}
     made = [(f"chart-{k}", _chart(chart)) for k, chart in enumerate(charts)]
     made += [(f"level-{k}", _level_sets(part)) for k, part in enumerate(slices)]
-    for element, root in made:
-        document.add_root(root)
-        roots[root.id] = element
+    with document.models.freeze():
+        for element, root in made:
+            document.add_root(root)
+            roots[root.id] = element
     told = json.dumps({"document": document.to_json(deferred=False), "roots": roots})
     order: dict[str, str] = {}
     told = IDS.sub(lambda mark: f'"p{order.setdefault(mark[1], str(len(order)))}"', told)
@@ -76,12 +82,13 @@ def _chart(chart: Chart) -> Any:
     room = 0.04 * (high - low or 1.0)
     ranges = {"x_range": _room(chart), "y_range": (low - room, high + room)}
     shown = _frame(chart.x_label, chart.y_label, **ranges, **kinds)
-    points = [_line(shown, line) for line in chart.lines]
+    drawn = [_line(line) for line in chart.lines]
+    shown.renderers = [glyph for curve in drawn for glyph in curve]
     far = "@x{0,0.####}" if not chart.log_x else "@x{0.0000}"
     tips = [("", "$name"), (chart.x_label, far), (chart.y_label, "@y{0,0.[000]}")]
     if any(line.low is not None for line in chart.lines):
         tips.append(("band", "@low{0,0.[000]} – @high{0,0.[000]}"))
-    shown.add_tools(HoverTool(renderers=points, tooltips=tips))
+    shown.add_tools(HoverTool(renderers=[curve[-1] for curve in drawn], tooltips=tips))
     if chart.log_x:
         shown.xaxis.ticker = LogTicker(desired_num_ticks=4, mantissas=[1, 2, 5])
     else:
@@ -120,24 +127,29 @@ def _frame(x_label: str, y_label: str, **more: Any) -> Any:
     return shown
 
 
-def _line(shown: Any, line: Line) -> Any:
-    """A curve with its band; returns its points, which answer to the pointer."""
+def _line(line: Line) -> list[GlyphRenderer]:
+    """A curve: its band where it has one, the line, and its points, which answer to the pointer.
+
+    The three share one source. They are made one by one, because `figure.line` would make seven
+    objects more for each, and Bokeh takes a millisecond for every object.
+    """
     data = {"x": line.x, "y": line.y}
     if line.low is not None and line.high is not None:
         data |= {"low": line.low, "high": line.high}
-    source = ColumnDataSource(
-        {k: plain(np.asarray(v), 5, significant=True) for k, v in data.items()}
-    )
+    rounded = {k: plain(np.asarray(v), 5, significant=True) for k, v in data.items()}
+    told = {"data_source": ColumnDataSource(rounded), "view": CDSView(), "name": line.label}
     tags = [line.team, -1 if line.member is None else line.member, tint(line.colour)]
-    look = {"source": source, "name": line.label, "tags": tags}
+    ink, glyphs = line.colour, []
     if "low" in data:
-        shown.varea("x", "low", "high", fill_color=line.colour, fill_alpha=0.16, **look)
+        shade = {"fill_color": ink, "fill_alpha": 0.16, "tags": tags}
+        glyphs.append(GlyphRenderer(glyph=VArea(x="x", y1="low", y2="high", **shade), **told))
     width, alpha = (2.6, 1.0) if line.thick else (1.4, 0.85)
-    shown.line("x", "y", line_color=line.colour, line_width=width, line_alpha=alpha, **look)
-    return shown.scatter(
-        "x", "y", size=9, fill_alpha=0.0, line_alpha=0.0, hover_fill_alpha=1.0,
-        fill_color=line.colour, line_color=line.colour, hover_line_alpha=0.0, **look,
-    )  # fmt: skip
+    look = {"line_color": ink, "line_width": width, "line_alpha": alpha, "tags": tags}
+    glyphs.append(GlyphRenderer(glyph=Curve(x="x", y="y", **look), **told))
+    spot = {"x": "x", "y": "y", "size": 9, "fill_color": ink, "line_color": None, "tags": tags}
+    hover = Scatter(fill_alpha=1.0, **spot)
+    glyphs.append(GlyphRenderer(glyph=Scatter(fill_alpha=0, **spot), hover_glyph=hover, **told))
+    return glyphs
 
 
 # ---- level sets ----
