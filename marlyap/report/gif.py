@@ -49,12 +49,18 @@ def film_pair_gif(left: Film, right: Film, path: str | Path, fps: float | int = 
     films_gif([left, right], path, fps)
 
 
-def films_gif(films: Sequence[Film], path: str | Path, fps: float | int = 10) -> None:
-    """Several episodes side by side, at one scale and at one time.
+def films_gif(
+    films: Sequence[Film],
+    path: str | Path,
+    fps: float | int = 10,
+    dpi: int = DPI,
+    most: int = MOST_FRAMES,
+) -> None:
+    """Several episodes side by side, at one scale and at one time, in at most so many frames.
 
     Raises UserError if the file cannot be written.
     """
-    frames = pictures(aligned(scenes(films)))
+    frames = pictures(aligned(scenes(films)), dpi, most)
     palette = Image.new("P", (1, 1))
     palette.putpalette([channel for colour in _inks() for channel in colour])
     small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
@@ -64,14 +70,15 @@ def films_gif(films: Sequence[Film], path: str | Path, fps: float | int = 10) ->
     write_bytes_atomic(Path(path), save)
 
 
-def pictures(shown: Sequence[Scene]) -> list[Image.Image]:
+def pictures(
+    shown: Sequence[Scene], dpi: int = DPI, most: int = MOST_FRAMES
+) -> list[Image.Image]:
     """Every frame of several scenes side by side."""
-    figure = plot.figure(
-        SIDE * len(shown), SIDE * max(_height(scene) for scene in shown), DPI, layout="constrained"
-    )
+    height = SIDE * max(_height(scene) for scene in shown)
+    figure = plot.figure(SIDE * len(shown), height, dpi, layout="constrained")
     spaces = figure.subfigures(1, len(shown), squeeze=False).ravel()
     panes = [_Pane(space, scene) for space, scene in zip(spaces, shown, strict=True)]
-    return _frames(figure, panes, max(len(scene.times) for scene in shown))
+    return _frames(figure, panes, _times(max(len(scene.times) for scene in shown), most))
 
 
 def _strips(scene: Scene) -> int:
@@ -127,11 +134,11 @@ def _once(axes, artist) -> None:
     artist.remove()
 
 
-def _frames(figure: Figure, panes: Sequence[_Pane], length: int) -> list[Image.Image]:
+def _frames(figure: Figure, panes: Sequence[_Pane], times: Sequence[int]) -> list[Image.Image]:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     still, made = canvas.copy_from_bbox(figure.bbox), []
-    for k in _times(length):
+    for k in times:
         canvas.restore_region(still)
         for pane in panes:
             pane.draw(k)
@@ -139,9 +146,9 @@ def _frames(figure: Figure, panes: Sequence[_Pane], length: int) -> list[Image.I
     return made
 
 
-def _times(length: int) -> list[int]:
+def _times(length: int, most: int) -> list[int]:
     """The frames to draw: all of a short film, some of a long one, the last always."""
-    stride = math.ceil(length / MOST_FRAMES)
+    stride = math.ceil(length / most)
     return [*range(0, length - 1, stride), length - 1]
 
 

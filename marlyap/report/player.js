@@ -62,6 +62,10 @@
   function paneOf(film, box) {
     const scene = box.querySelector(".scene"), strip = box.querySelector(".strip"), end = film.steps - 1;
     const at = () => Math.min(frame, end);
+    if (film.panels.length === 1 && !film.panels[0].lanes) { // a row of bodies needs no square
+      const [left, right, bottom, top] = film.panels[0].window, tall = (top - bottom) / (right - left);
+      if (tall < 0.9) scene.style.aspectRatio = String(1 / tall);
+    }
     const bodyColour = (body) => colourOf(film.tints[body]);
 
     function position(agent, time) {

@@ -23,6 +23,7 @@ PAPER, INK, SOFT, RULE, FAINT = "#ffffff", "#1c1d20", "#5e6169", "#dddcd6", "#ec
 
 TRAIL = 1.5  # s, for which a body's trail is drawn strongly
 RISE = 1e-3  # of the largest value: a smaller rise is not marked
+FLAT = 0.4  # least height of a view from above where its width is 1, and the scene is a row
 MOST_STRIPS = 8
 MOST_PLAYED = 300  # times of a film in the page; of a longer one every so many are left out
 
@@ -230,10 +231,10 @@ def _around(panels: Sequence[Panel]) -> tuple[float, float, float, float]:
 
 
 def framed(scene: Scene, side: float) -> Scene:
-    """A scene in the plane, shown in a square of this side."""
+    """A scene in the plane, shown as wide as this side."""
     left, right, bottom, top = scene.panels[0].window
-    x, y = (left + right) / 2, (bottom + top) / 2
-    window = x - side / 2, x + side / 2, y - side / 2, y + side / 2
+    x, y, tall = (left + right) / 2, (bottom + top) / 2, side * scene.panels[0].height
+    window = x - side / 2, x + side / 2, y - tall / 2, y + tall / 2
     return replace(scene, panels=(replace(scene.panels[0], window=window),))
 
 
@@ -287,7 +288,8 @@ def _panels(places: np.ndarray, goals: np.ndarray, d: int, frames: Frames) -> tu
         window = x - side / 2, x + side / 2, 0.3 - places.shape[1], 0.7
         return (Panel((0, 1), (name("x"), "body"), window, lanes=True),)
     side = 1.12 * max(float(extent[:2].max()), 6 * radius, 1e-3)
-    half = [side / 2, side / 2, max(float(extent[-1]) / 2 + 0.07 * side, side / 8)]
+    tall = side if d > 2 or extent[1] > FLAT * extent[0] else FLAT * side
+    half = [side / 2, tall / 2, max(float(extent[-1]) / 2 + 0.07 * side, side / 8)]
     view = lambda a, b: (
         *(float(middle[a] - half[a]), float(middle[a] + half[a])),
         *(float(middle[b] - half[b]), float(middle[b] + half[b])),
