@@ -20,7 +20,8 @@ def notebook(text: str) -> str:
     whole = {"cells": [c for c in cells if c["source"]], "metadata": about}
     for k, made in enumerate(whole["cells"]):
         made["id"] = f"cell-{k}"
-    return json.dumps(whole | {"nbformat": 4, "nbformat_minor": 5}, indent=1, ensure_ascii=False) + "\n"
+    whole |= {"nbformat": 4, "nbformat_minor": 5}
+    return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
 
 
 def cell(text: str, code: bool) -> dict:

@@ -36,10 +36,9 @@ def several() -> Page:
         for who, gain in (("masac", 0.5), ("masac-lyapunov", 2.0))
     ]
     worst = replace(rollout(3, label="worst for reach", run="masac"), shot="case")
-    claims = [
-        Claim(name=name, claim="it arrives", evidence=evidence, holds=True, bound=0.9, shot="case")
-        for name, evidence in (("reach", "statistical"), ("decrease", "proved"), ("seen", "observed"))
-    ]  # fmt: skip
+    said = {"claim": "it arrives", "holds": True, "bound": 0.9, "shot": "case"}
+    kinds = {"reach": "statistical", "decrease": "proved", "seen": "observed"}
+    claims = [Claim(name=name, evidence=kind, **said) for name, kind in kinds.items()]
     return replace(
         full_page(),
         groups=(team("masac"), team("masac-lyapunov"), team("droop", unit="Hz")),
@@ -146,24 +145,28 @@ def test_a_drag_zooms_and_a_double_click_shows_all_again(page):
     assert ranges(page) == pytest.approx(whole)
 
 
+SPOT = """() => { // where a point of the first curve is, in pixels of its chart
+  const figure = marlyapCharts.figures.get("chart-0"), { x, y } = figure.renderers[0].data_source.data;
+  const { left, top, width, height } = Bokeh.index.find_one_by_id(figure.id).frame.bbox, k = 20;
+  const share = (range, value) => (value - range.start) / (range.end - range.start);
+  return [left + width * share(figure.x_range, x[k]), top + height * (1 - share(figure.y_range, y[k]))];
+}"""  # noqa: E501
+TOLD = """() => { // the text inside the charts, where tooltips are
+  const within = (root) => [...root.querySelectorAll("*")].flatMap((element) => {
+    const inside = element.shadowRoot;
+    return inside ? [inside.textContent, ...within(inside)] : [];
+  });
+  return within(document.getElementById("chart-0")).join(" ");
+}"""
+
+
 def test_pointing_at_a_curve_shows_its_values(page):
-    box = place(page)
-    spot = page.evaluate(
-        """() => { const figure = marlyapCharts.figures.get("chart-0"), data = figure.renderers[0].data_source.data;
-        const view = Bokeh.index.find_one_by_id(figure.id), k = 20;
-        const frame = view.frame.bbox, f = (range, v) => (v - range.start) / (range.end - range.start);
-        return [frame.left + frame.width * f(figure.x_range, data.x[k]), frame.top + frame.height * (1 - f(figure.y_range, data.y[k])), data.y[k]]; }"""
-    )
-    page.mouse.move(box["x"] + spot[0] - 30, box["y"] + spot[1] - 20)
-    page.mouse.move(box["x"] + spot[0], box["y"] + spot[1], steps=5)
-    page.wait_for_timeout(400)
-    told = page.evaluate(
-        """() => { const found = []; const look = (root) => { for (const e of root.querySelectorAll("*")) {
-        if (e.className && String(e.className).includes("tooltip")) found.push(e.textContent);
-        if (e.shadowRoot) { if (e.tagName === "DIV") { const t = e.shadowRoot.textContent; if (t.includes("environment steps")) found.push(t); } look(e.shadowRoot); } } };
-        look(document); return found.join(" "); }"""
-    )
-    assert "masac" in told and "environment steps" in told
+    box, (x, y) = place(page), page.evaluate(SPOT)
+    assert "10,240" not in page.evaluate(TOLD) and "masac, seed 0" not in page.evaluate(TOLD)
+    page.mouse.move(box["x"] + x - 30, box["y"] + y - 20)
+    page.mouse.move(box["x"] + x, box["y"] + y, steps=5)
+    until(page, lambda: "masac, seed 0" in page.evaluate(TOLD))
+    assert "environment steps" in page.evaluate(TOLD)
 
 
 def test_a_switch_hides_a_run_in_every_chart(page):

@@ -32,7 +32,7 @@ from marlyap.report.data import (
     Within,
 )
 from marlyap.report.gif import film_gif, film_pair_gif
-from marlyap.report.interactive import embedded as lively, library
+from marlyap.report.interactive import library
 from marlyap.report.page import html
 from marlyap.report.plot import moment
 from marlyap.report.png import learning_curves_png, trajectories_png

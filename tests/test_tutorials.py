@@ -82,8 +82,12 @@ def sentences(text: str) -> list[str]:
     text = re.sub(r"^\|[-| :]+\|$", "", text, flags=re.M)
     text = re.sub(r"^\s*(#+ .*|[-*] |\d+\. )", lambda m: "\n\n" + m[0], text, flags=re.M)
     text = re.sub(r"^(#+ .*)$", r"\1\n", text, flags=re.M)
-    parts = [cell for block in re.split(r"\n\s*\n", text) for cell in re.split(r"\||\n(?=\|)", block)]
-    return [s.strip() for part in parts for s in re.split(r"(?<=[.!?])[*\"')]*\s+", part) if s.strip()]
+    parts = [
+        cell for block in re.split(r"\n\s*\n", text) for cell in re.split(r"\||\n(?=\|)", block)
+    ]
+    return [
+        s.strip() for part in parts for s in re.split(r"(?<=[.!?])[*\"')]*\s+", part) if s.strip()
+    ]
 
 
 def words(sentence: str) -> list[str]:

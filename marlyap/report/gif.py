@@ -70,9 +70,7 @@ def films_gif(
     write_bytes_atomic(Path(path), save)
 
 
-def pictures(
-    shown: Sequence[Scene], dpi: int = DPI, most: int = MOST_FRAMES
-) -> list[Image.Image]:
+def pictures(shown: Sequence[Scene], dpi: int = DPI, most: int = MOST_FRAMES) -> list[Image.Image]:
     """Every frame of several scenes side by side."""
     height = SIDE * max(_height(scene) for scene in shown)
     figure = plot.figure(SIDE * len(shown), height, dpi, layout="constrained")

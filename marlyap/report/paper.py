@@ -10,7 +10,7 @@ import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, cast
 
 import matplotlib
 import numpy as np
@@ -25,8 +25,7 @@ from marlyap.statistics import mean_interval
 from marlyap.storage.store import write_bytes_atomic
 
 
-Band = Literal["range", "interval"]
-BANDS: tuple[Band, ...] = get_args(Band)
+BANDS = ("range", "interval")
 OF_LOGS = ("learning", "return")  # kinds that need no evaluation
 DASHES = ("-", (0, (5, 2)), (0, (1.2, 1.6)), (0, (5, 2, 1.2, 2)), (0, (8, 2)), (0, (3, 1.5)))
 STYLE: dict[str, Any] = {
@@ -47,10 +46,10 @@ FORMATS = ("pdf", "svg", "eps", "png")
 
 def plot(
     runs: Sequence[Run | Path | str],
-    kind: Kind = "learning",
+    kind: str = "learning",
     axes: Axes | None = None,
     *,
-    band: Band = "range",
+    band: str = "range",
     episodes: int = 500,
     seed: int = 0,
     width: float = 3.5,
@@ -74,7 +73,7 @@ def plot(
     if band not in BANDS:
         raise UserError(f"band: there is no band called '{band}'; take range or interval.")
     opened = [run if isinstance(run, Run) else Run.open(run) for run in _each(runs)]
-    shown = _shown(opened, kind, band, episodes, seed)
+    shown = _shown(opened, cast(Kind, kind), band, episodes, seed)
     with styled():
         at = axes if axes is not None else _new(width)
         _draw(at, shown)
@@ -89,7 +88,7 @@ def _each(runs: Sequence[Run | Path | str]) -> list[Run | Path]:
     return made
 
 
-def _shown(runs: Sequence[Run], kind: Kind, band: Band, episodes: int, seed: int) -> Chart:
+def _shown(runs: Sequence[Run], kind: Kind, band: str, episodes: int, seed: int) -> Chart:
     """The chart, its runs of one game or, of a learning curve, of several."""
     if kind in OF_LOGS:
         trained, groups = logged(runs), ()
