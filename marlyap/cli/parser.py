@@ -11,6 +11,7 @@ from marlyap.cli import (
     demo,
     evaluate,
     listing,
+    plot,
     recheck,
     report,
     train,
@@ -58,6 +59,7 @@ VERBS: dict[str, Verb] = {
     "check-task": check_task,
     "report": report,
     "watch": watch,
+    "plot": plot,
     "list": listing,
 }
 
