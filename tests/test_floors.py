@@ -34,6 +34,7 @@ FLOORS = """
     certificates
     conformance
     runs
+    sweeps
     report
     cli
     __main__

@@ -13,6 +13,7 @@ from marlyap.cli import (
     listing,
     recheck,
     report,
+    sweep,
     train,
     watch,
 )
@@ -51,6 +52,7 @@ class Verb(Protocol):
 VERBS: dict[str, Verb] = {
     "demo": demo,
     "train": train,
+    "sweep": sweep,
     "evaluate": evaluate,
     "bench": bench,
     "certify": certify,

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from marlyap.errors import UserError, check_range
@@ -57,3 +59,17 @@ class Job:
         """What `to_json` wrote."""
         data = json.loads(text)
         return cls(data["run"], data["core"], Launch(**data["how"]))
+
+
+def seeds(words: Iterable[str]) -> list[int]:
+    """The seeds asked for: whole numbers, each once."""
+    each = [w for word in words for w in word.split(",")]
+    for word in each:
+        if not re.fullmatch(r"[+-]?\d+", word.strip()):
+            raise UserError(f"seeds: '{word}' is not a whole number.")
+    numbers = [int(w) for w in each]
+    if len(set(numbers)) != len(numbers):
+        raise UserError(f"seeds: {' '.join(each)} names a seed twice.")
+    if not all(0 <= n < 2**31 for n in numbers):
+        raise UserError(f"seeds: {' '.join(each)} must lie between 0 and 2147483647.")
+    return numbers

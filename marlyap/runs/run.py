@@ -30,6 +30,7 @@ from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.health import Health
 from marlyap.learning.schedule import Schedule
 from marlyap.learning.source import shape
+from marlyap.learning.traced import with_arrays
 from marlyap.learning.trainer import Carry, Trainer
 from marlyap.nets.nets import LyapunovNet, NormNet
 from marlyap.runs import config
@@ -326,7 +327,7 @@ def begin(trainer: Trainer, seed: int) -> Carry:
     """
     key = seeds.stream(seed, "train")
     like = lambda: eqx.filter_eval_shape(trainer.begin, key)[0]
-    carry, health = export_cache.compiled(_begin, trainer, key, like)(key)
+    carry, health = export_cache.compiled(_begin, with_arrays(trainer), key, like)(key)
     if fault := Health(**health).by_task(trainer.game.agents):
         when = f"in the warm-up (seed {seed})"
         raise UserError(f"{fault.says(when)} (check-task says more).")
