@@ -140,7 +140,9 @@ def test_an_upward_import_is_noticed(monkeypatch):
 @each_file
 def test_only_pictures_import_matplotlib(file):
     """Matplotlib and Pillow stay out of training: their modules are imported when one draws."""
-    drawing = {f"marlyap.report.{name}" for name in ("bench", "gif", "page", "plot", "png")}
+    drawing = {
+        f"marlyap.report.{name}" for name in ("bench", "curves", "gif", "page", "plot", "png")
+    }
     if module(file) not in drawing:
         assert not {name for name in imported(file) if name.split(".")[0] in ("matplotlib", "PIL")}
         first = [node for node in TREES[file].body if isinstance(node, ast.Import | ast.ImportFrom)]

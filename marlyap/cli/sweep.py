@@ -8,7 +8,7 @@ from typing import Any
 
 from marlyap.cli.common import Overrides, Result, say
 from marlyap.cli.environment import prepare
-from marlyap.cli.options import Once, number, place
+from marlyap.cli.options import TRACKERS, Once, number, place
 from marlyap.errors import UserError
 from marlyap.runs.job import Launch
 
@@ -55,12 +55,13 @@ def options(p: ArgumentParser) -> None:
     p.add_argument(
         "--on-nan", default="stop", help="when numbers diverge: stop (default) or rollback"
     )
+    p.add_argument("--log", nargs="+", default=[], help=TRACKERS)
 
 
 def run(args: Namespace, overrides: Overrides) -> Result:
     """Do what the first word says."""
     verb, *rest = args.words if args.words[0] in VERBS else ("all", *args.words)
-    how = Launch(args.parallel, args.on_nan, args.device)
+    how = Launch(args.parallel, args.on_nan, args.device, log=tuple(args.log))
     if verb in ("all", "make"):
         sweep = _made(args, rest, overrides)
     else:
@@ -72,15 +73,13 @@ def run(args: Namespace, overrides: Overrides) -> Result:
         sweep = Sweep.open(rest[0])
     if verb == "make":
         jobs = len(sweep.jobs)
-        say(f"Made: {sweep.directory}, {jobs} jobs. Train with: marlyap sweep run {rest_of(sweep)}")
+        say(
+            f"Made: {sweep.directory}, {jobs} jobs. Train with: marlyap sweep run {sweep.directory}"
+        )
         return {"sweep": str(sweep.directory), "jobs": jobs}, 0
     if verb in ("status", "watch", "table"):
         return _told(sweep, verb)
     return _run(sweep, args, how)
-
-
-def rest_of(sweep: Any) -> str:
-    return str(sweep.directory)
 
 
 def _made(args: Namespace, words: list[str], overrides: Overrides) -> Any:
@@ -103,9 +102,9 @@ def _made(args: Namespace, words: list[str], overrides: Overrides) -> Any:
             "sweep: name a TOML file, a task and an algorithm, or a verb and a directory."
         )
     prepare(args.device)
-    from marlyap.sweeps.go import make
+    from marlyap.sweeps.go import make_sweep
 
-    return make(plan, args.out or Path("sweeps") / name)
+    return make_sweep(plan, args.out or Path("sweeps") / name)
 
 
 def _refuse(args: Namespace, overrides: Overrides) -> None:
@@ -131,7 +130,7 @@ def _run(sweep: Any, args: Namespace, how: Launch) -> Result:
         prepare(args.device)
     tell = lambda: say("\nStopping at the next checkpoint; once more to stop at once.")
     with Stop(tell) as stop:
-        seen = go.run(sweep, args.on, args.workers, how, options, stop, args.retry)
+        seen = go.run_sweep(sweep, args.on, args.workers, how, options, stop, args.retry)
         statuses = live.show(sweep.plan, seen)
     for path in sweep.write(statuses):
         say(str(path))

@@ -50,8 +50,8 @@ def compiled(
     """`f(maker, .)` compiled for arguments shaped as this one; with `donate` they are used up.
 
     The arrays in `maker` are arguments as well, which are kept: the program is that of all makers
-    that differ in their values alone. f returns a tree and a dict of arrays; `like()` has the tree's
-    structure, with arrays or their shapes, and all that is not an array.
+    that differ in their values alone. f returns a tree and a dict of arrays; `like()` has the
+    tree's structure, with arrays or their shapes, and all that is not an array.
     """
     folder = os.environ.get(FOLDER)
     given, fixed = eqx.partition(argument, _has_shape)

@@ -1,8 +1,8 @@
 """The host loop over compiled iterations: progress, log, checkpoints, stopping."""
 
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -28,6 +28,7 @@ from marlyap.nets.nets import LyapunovNet, NormNet
 from marlyap.runs import config, events
 from marlyap.runs.progress import show
 from marlyap.runs.run import Run, begin, sound
+from marlyap.runs.sinks import Sinks
 from marlyap.simulation.rollout import Decentralised, Policy
 from marlyap.storage import store
 from marlyap.tasks import TASKS
@@ -42,7 +43,10 @@ class Diverged(UserError):
 
 
 def fit(
-    runs: list[Run], stop: Callable[[], bool] = lambda: False, attempts: int = 1
+    runs: list[Run],
+    stop: Callable[[], bool] = lambda: False,
+    attempts: int = 1,
+    log: Sequence[str] = (),
 ) -> Iterator[events.Event]:
     """Train `runs` to the end, or until `stop()`; yields a Progress for each run and iteration.
 
@@ -50,17 +54,20 @@ def fit(
     (`learning.traced`), alone; they advance together under `vmap`. Everything
     is saved at the end and when stopped, so that calling this again resumes bit for bit. A run in
     which a number stops being finite is stopped, the others continue; with more `attempts` it is
-    taken up again, from its last checkpoint and with other random numbers.
+    taken up again, from its last checkpoint and with other random numbers. `log` names trackers
+    that are told the log as well.
     Raises Diverged (a UserError) if this was so in every run to the last.
     """
     with ExitStack() as held:
         for run in runs:
             held.enter_context(store.lock(run.directory))
             store.sweep(run.directory)
-        yield from _fit(runs, stop, attempts)
+        yield from _fit(runs, stop, attempts, log)
 
 
-def _fit(runs: list[Run], stop: Callable[[], bool], attempts: int) -> Iterator[events.Event]:
+def _fit(
+    runs: list[Run], stop: Callable[[], bool], attempts: int, log: Sequence[str]
+) -> Iterator[events.Event]:
     """Train the runs that stand at the same iteration together, one such group after the other.
 
     A damaged checkpoint or a fault may have thrown one run further back than the others.
@@ -73,7 +80,10 @@ def _fit(runs: list[Run], stop: Callable[[], bool], attempts: int) -> Iterator[e
             yield from (events.Warned(*one.run.named, w) for w in one.warnings)
         faults = {}
         for _, group in groupby(sorted(loaded, key=_iteration), key=_iteration):
-            faults |= yield from _together([one.reseeded(attempt) for one in group], stop)
+            going = [one.reseeded(attempt) for one in group]
+            with ExitStack() as told:
+                sinks = [told.enter_context(closing(one.run.sinks(log))) for one in going]
+                faults |= yield from _together(going, sinks, stop)
         if not faults or stop():
             break
         if attempt + 1 < attempts:
@@ -108,7 +118,7 @@ def _iteration(loaded: _Loaded) -> int:
 
 
 def _together(
-    loaded: list[_Loaded], stop: Callable[[], bool]
+    loaded: list[_Loaded], sinks: list[Sinks], stop: Callable[[], bool]
 ) -> Generator[events.Event, None, dict[int, Diverged]]:
     """Train runs that stand at the same iteration; returns why, for each seed that was stopped."""
     faults: dict[int, Diverged] = {}
@@ -132,7 +142,7 @@ def _together(
                 if not any(alive):
                     return faults
             if alive[i]:
-                run.log(line)
+                sinks[i].line(run.log(line))
                 yield events.Progress(*run.named, line, trainer.iterations)
         if saved.due():
             yield from saved.save(runs, carry, alive, seconds)
@@ -204,6 +214,7 @@ class Trained:
         with store.lock(run.directory):
             for line in self.history:
                 run.log(line)
+            run.sinks().close()
             run.save(self.carry, self.history[-1]["seconds"])
         return run
 

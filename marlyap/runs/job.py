@@ -26,8 +26,14 @@ class Launch:
     attempts: int = 3  # with rollback, how often a run is tried in all
     task: str | None = None  # path/to/file.py:Name where the task is code of the user's own, and
     algorithm: str | None = None  # likewise; None: where the run's own classes were defined
+    log: tuple[str, ...] = ()  # trackers that are told as well: wandb, mlflow, trackio
 
     def __post_init__(self):
+        object.__setattr__(self, "log", tuple(self.log))  # JSON has lists
+        if self.log:
+            from marlyap.runs.sinks import check
+
+            check(self.log)
         for field, choices in CHOICES.items():
             value = getattr(self, field)
             if value not in choices:

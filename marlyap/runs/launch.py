@@ -72,7 +72,7 @@ def together(runs: list[Run], how: Launch, stop: Callable[[], bool]) -> Iterator
         runs = [run for run in runs if program(run.trainer) != what]
         says: dict[str, str] = {}
         try:
-            for event in fit(group, stop, how.tries):
+            for event in fit(group, stop, how.tries, how.log):
                 if isinstance(event, events.Diverged):
                     says[event.run] = event.says
                 yield event

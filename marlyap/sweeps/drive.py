@@ -3,7 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from marlyap.runs.job import Launch
 from marlyap.storage import store
@@ -18,6 +18,7 @@ TOGETHER = 64  # jobs in one program, at most
 DEATHS = 3  # of its process, with nothing saved in between, until a job has failed
 
 
+@runtime_checkable
 class Source(Protocol):
     """Says which jobs come next."""
 
@@ -122,10 +123,9 @@ class _Driver:
         while True:
             while self.again and self.again[0][0] <= time.monotonic():
                 self.ready.append(self.again.popleft()[1])
-            if not self.ready and not (new := self.source.take()):
+            self.ready.extend([] if self.ready else self.source.take())
+            if not self.ready:
                 return None
-            elif not self.ready:
-                self.ready.extend(new)
             job = self.ready.popleft()
             state = status(job).state
             if state == "running":
@@ -157,6 +157,7 @@ class _Driver:
                 self.deaths[job.name] = (count, now.iteration)
                 if count >= DEATHS:
                     says = f"{job.directory}: {ended.says}, {count} times in a row.\n"
+                    job.directory.parent.mkdir(parents=True, exist_ok=True)
                     store.write_text_atomic(job.beside("failed"), says)
                     continue
             self.again.append((time.monotonic() + (LOOK if not ended.says else 0.0), job))

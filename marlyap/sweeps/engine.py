@@ -9,7 +9,7 @@ import threading
 from contextlib import suppress
 from dataclasses import replace
 from queue import Empty, Queue
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from marlyap.errors import UserError
 from marlyap.sweeps.unit import Unit
@@ -26,6 +26,7 @@ class Ended(NamedTuple):
     says: str | None  # why its process ended, if it did so before the unit
 
 
+@runtime_checkable
 class Engine(Protocol):
     """Starts units, tells which have ended, stops them. The folder says what became of them."""
 

@@ -18,7 +18,7 @@ from marlyap.sweeps.plan import WORDS, Plan
 ENGINES = ("local", "ray", "slurm")
 
 
-def make(plan: Plan | Path | str, out: Path | str) -> Sweep:
+def make_sweep(plan: Plan | Path | str, out: Path | str) -> Sweep:
     """Check every cell of a plan, given or in a TOML file, and write it down in folder `out`.
 
     Nothing is trained. In a folder that holds a sweep already the plan is replaced, and runs with
@@ -45,7 +45,7 @@ def _placed(plan: Plan) -> Plan:
     return replace(plan, fixed=fixed, grid=grid, cells=cells)
 
 
-def run(
+def run_sweep(
     sweep: Sweep,
     on: str = "local",
     slots: int | None = None,

@@ -78,8 +78,6 @@ def status(job: Job) -> Status:
         if isinstance(result, dict):
             done = result.get("iterations", job.cell.iterations)
             return Status(job, "finished", done, success=result.get("success"), result=result)
-    if not job.beside("lock").exists():
-        return Status(job, "waiting")
     lines = last_lines(directory / "log.jsonl")
     last = lines[-1] if lines else {}
     success = next((line["success"] for line in reversed(lines) if "success" in line), None)

@@ -4,6 +4,7 @@ The folder of the sweep has to be on a file system that all nodes share. Without
 of this machine alone is started, and ends with this process.
 """
 
+import time
 from contextlib import suppress
 from typing import Any
 
@@ -45,6 +46,7 @@ class OnRay:
 
     def ended(self, seconds: float) -> list[Ended]:
         if not self.active:
+            time.sleep(seconds)
             return []
         ready, _ = self.ray.wait([*self.active], timeout=seconds, num_returns=1)
         found = []

@@ -12,7 +12,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,16 +58,36 @@ class Search:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is trained. `of_toml` and `of_words` make it, and say in one sentence what is wrong."""
+    """What is trained; `of_toml` reads one.
 
-    seeds: tuple[int, ...] = (0,)
-    fixed: dict[str, str] = dataclasses.field(default_factory=dict)  # set in every cell
-    grid: dict[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
-    cells: tuple[Cell, ...] = ()  # a list, each crossed with the grid
+    Values are numbers, words, or lists of those, and are kept as one would type them. Raises
+    UserError, naming the entry, for a plan that leaves something out or says something twice.
+    """
+
+    seeds: Sequence[int] = (0,)
+    fixed: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # set in every cell
+    grid: Mapping[str, Sequence[Any]] = dataclasses.field(default_factory=dict)
+    cells: Sequence[Mapping[str, Any]] = ()  # a list, each crossed with the grid
     search: Search | None = None
     evaluate: int = 0  # held-out starts of every finished job; 0: none
 
     def __post_init__(self):
+        put = lambda name, value: object.__setattr__(self, name, value)
+        put("seeds", tuple(seeds(map(str, self.seeds))))
+        put("fixed", _texts(self.fixed, "fixed."))
+        for name, values in self.grid.items():
+            if isinstance(values, str) or not isinstance(values, Sequence):
+                raise UserError(f"grid.{name}: {values!r} is no list; write [{values!r}].")
+        grid = {k: [text_of(v, f"grid.{k}") for v in values] for k, values in self.grid.items()}
+        put("grid", {k: tuple(values) for k, values in _known(grid).items()})
+        cells = enumerate(self.cells, 1)
+        put("cells", tuple(_texts(cell, f"cell {i}: ") for i, cell in cells))
+        if self.search is not None:
+            _known(dict(self.search.ranges))
+        self._complete()
+
+    def _complete(self) -> None:
+        """Raise UserError for what is missing, empty, or there twice."""
         check_range("evaluate", self.evaluate, 0, 10_000_000)
         if "task" not in self.varied and "task" not in self.fixed:
             raise UserError('task: the sweep names none; write task = "rendezvous".')
@@ -82,6 +102,8 @@ class Plan:
         for (a, one), (b, other) in itertools.combinations(zip(names, places, strict=True), 2):
             for name in one.keys() & other.keys():
                 raise UserError(f"{name}: it is set in {a} and in {b}; leave one out.")
+        if self.search is not None and self.count > 1:
+            raise UserError("search: it stands without a grid or a list of cells; fix what is one.")
         if (count := self.count) > MOST:
             raise UserError(f"grid: it has {count} cells; take {MOST} at most.")
 
@@ -121,8 +143,6 @@ class Plan:
                     for k, r in found.pop("ranges").items()
                 }
                 data["search"] = Search(ranges=ranges, **found)
-            data["seeds"], data["cells"] = tuple(data["seeds"]), tuple(data["cells"])
-            data["grid"] = {k: tuple(v) for k, v in data["grid"].items()}
             return cls(**data)
         except (TypeError, KeyError, AttributeError) as error:
             raise UserError(f"sweep: {where} is damaged ({error}); use another copy.") from None
@@ -158,8 +178,7 @@ def of_data(data: Mapping[str, Any]) -> Plan:
     for key in ("fixed", "grid", "search"):
         if not isinstance(data.get(key, {}), dict):
             raise UserError(f"{key}: it has to be a table, as in [{key}].")
-    fixed = {k: text_of(v, f"fixed.{k}") for k, v in _flat(data.get("fixed", {})).items()}
-    fixed |= {k: text_of(data[k], k) for k in WORDS if k in data}
+    fixed = _flat(data.get("fixed", {})) | {k: data[k] for k in WORDS if k in data}
     cells = data.get("cells", [])
     if not isinstance(cells, list) or not all(isinstance(c, dict) for c in cells):
         raise UserError("cells: it has to be a list of tables, as in [[cells]].")
@@ -172,26 +191,13 @@ def of_data(data: Mapping[str, Any]) -> Plan:
     if not isinstance(evaluate, int) or isinstance(evaluate, bool):
         raise UserError(f"evaluate: {evaluate!r} is not a whole number.")
     return Plan(
-        seeds=tuple(seeds([str(s) for s in listed])),
-        fixed=_known(fixed),
-        grid=_grid(_flat(data.get("grid", {}))),
-        cells=tuple(
-            _known({k: text_of(v, f"cell {i}: {k}") for k, v in _flat(cell).items()})
-            for i, cell in enumerate(cells, 1)
-        ),
+        seeds=listed,
+        fixed=fixed,
+        grid=_flat(data.get("grid", {})),
+        cells=[_flat(cell) for cell in cells],
         search=_search(data["search"]) if "search" in data else None,
         evaluate=evaluate,
     )
-
-
-def _grid(values: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """The lists of a grid as words."""
-    found: dict[str, tuple[str, ...]] = {}
-    for name, listed in values.items():
-        if not isinstance(listed, list):
-            raise UserError(f"grid.{name}: {listed!r} is no list; write [{listed!r}].")
-        found[name] = tuple(text_of(v, f"grid.{name}") for v in listed)
-    return _known(found)
 
 
 def _search(data: Mapping[str, Any]) -> Search:
@@ -200,7 +206,6 @@ def _search(data: Mapping[str, Any]) -> Search:
     ranges = {k: _range(v, k) for k, v in _flat_ranges(data).items() if k not in SEARCH}
     if not ranges:
         raise UserError('search: no field is searched; write "algorithm.rate_Q" = {low = ...}.')
-    _known(ranges)
     for name in ("trials", "seed"):
         if not isinstance(value := settings.get(name, 1), int) or isinstance(value, bool):
             raise UserError(f"search.{name}: {value!r} is not a whole number.")
@@ -251,6 +256,11 @@ def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
+def _texts(fields: Mapping[str, Any], where: str) -> Cell:
+    """Values as one would type them. Raises UserError for a name that cannot be set."""
+    return _known({k: text_of(v, f"{where}{k}") for k, v in fields.items()})
+
+
 def text_of(value: Any, where: str) -> str:
     """A value of TOML as one would type it. Raises UserError for a date or a table."""
     match value:
@@ -258,7 +268,7 @@ def text_of(value: Any, where: str) -> str:
             return str(value).lower()
         case int() | float() | str():
             return canonical(str(value))
-        case list():
+        case list() | tuple():
             return ",".join(text_of(v, where) for v in value)
     raise UserError(f"{where}: {value!r} is not a number, a word, true, false or a list.")
 
@@ -312,11 +322,6 @@ def of_words(
         if name in found:
             raise UserError(f"grid.{name}: it is given twice.")
         between = ";" if ";" in values else ","  # ; where the values have commas themselves
-        found[name] = tuple(canonical(v) for v in values.split(between) if v.strip())
+        found[name] = tuple(v for v in values.split(between) if v.strip())
     words = {"task": task, "algorithm": algorithm} | ({"preset": preset} if preset else {})
-    return Plan(
-        seeds=tuple(seeds(listed)),
-        fixed=_known({k: canonical(v) for k, v in fixed.items()} | words),
-        grid=_known(found),
-        evaluate=evaluate,
-    )
+    return Plan(seeds(listed), {**fixed, **words}, found, evaluate=evaluate)
