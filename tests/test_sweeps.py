@@ -22,7 +22,7 @@ from marlyap.sweeps.drive import DEATHS, Listed, drive
 from marlyap.sweeps.engine import Ended
 from marlyap.sweeps.folder import Sweep
 from marlyap.sweeps.jobs import Entry, Job, held, status
-from marlyap.sweeps.plan import Plan, canonical, name_of, of_data
+from marlyap.sweeps.plan import Plan, Range, Search, canonical, name_of, of_data
 from marlyap.sweeps.train import train
 from marlyap.sweeps.unit import Unit
 
@@ -30,7 +30,7 @@ from marlyap.sweeps.unit import Unit
 SMALL = {
     "task.agents": "2",
     "task.horizon": "4",
-    "task.dynamics": "single",
+    "task.dynamics": "single-integrator",
     "schedule.steps": "48",
     "schedule.environments": "2",
     "schedule.steps_per_update": "4",
@@ -406,3 +406,140 @@ def test_killing_the_driver_leaves_no_orphan_and_the_next_one_finishes(tmp_path)
     engine = Fake(finished)
     last = run_with(sweep, engine)  # nothing of the dead one keeps a job
     assert {s.state for s in last.values()} == {"finished"} and len(engine.started) == 2
+
+
+# --- Engines, and a search -----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory):
+    """Eight tiny jobs, trained by the processes of this machine."""
+    return ran(tmp_path_factory.mktemp("local") / "q", "local")
+
+
+def ran(place, on, options=None):
+    grid = {"algorithm.rate_Q": RATES, "algorithm.tau": (0.005, 0.01)}
+    sweep = go.make_sweep(plan(grid=grid, seeds=(0, 1)), place)
+    *_, last = go.run_sweep(sweep, on, 2, options=options)
+    assert {s.state for s in last} == {"finished"}, [s.says for s in last]
+    return {s.job.name: s.result["policy"] for s in last}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("on", "package", "options"),
+    [("ray", "ray", {"num_cpus": "2"}), ("slurm", "submitit", {"cluster": "local"})],
+)
+def test_a_sweep_is_the_same_wherever_it_runs(on, package, options, local, tmp_path):
+    pytest.importorskip(package)
+    found = ran(tmp_path / "q", on, options)
+    assert found == local and len({*found.values()}) == 8
+
+
+@pytest.mark.parametrize(("on", "package"), [("ray", "ray"), ("slurm", "submitit")])
+def test_an_engine_that_is_not_installed_is_one_sentence(on, package, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(UserError, match=rf"^on: {on} needs {package}; install it with pip install"):
+        [*go.run_sweep(made(tmp_path / "q"), on)]
+
+
+def test_an_engine_that_is_unknown_is_named(tmp_path):
+    for on, options, says in (("moon", None, "^on: 'moon' must be"), ("local", {"a": "b"}, "no o")):
+        with pytest.raises(UserError, match=says):
+            [*go.run_sweep(made(tmp_path / "q"), on, options=options)]
+
+
+SEARCH = Search(
+    ranges={
+        "algorithm.rate_Q": Range(1e-4, 1e-2, log=True),
+        "algorithm.batch": Range(2, 6, whole=True),
+        "algorithm.heads": Range(choices=("team", "agent")),
+    },
+    trials=7,
+)
+
+
+def searched(place, what=finished):
+    """A search whose jobs end at once; the plan fixes what is not searched."""
+    pytest.importorskip("optuna")
+    from marlyap.sweeps.search import Searched
+
+    fixed = {k: v for k, v in FIXED.items() if k not in SEARCH.ranges}
+    sweep = go.make_sweep(Plan(fixed=fixed, search=SEARCH, seeds=(0, 1)), place)
+    engine = Fake(what)
+    *_, last = drive(sweep, engine, Searched(sweep), Launch())
+    return sweep, engine, last
+
+
+def good(unit):
+    """Success grows with the learning rate."""
+    for job in unit.jobs:
+        job.directory.mkdir(parents=True, exist_ok=True)
+        best = float(job.cell.set["algorithm.rate_Q"]) * 100
+        store.write_text_atomic(job.directory / "result.json", json.dumps({"best": best}))
+
+
+def test_a_search_proposes_cells_that_can_be_trained_and_remembers_them(tmp_path, monkeypatch):
+    monkeypatch.setattr("marlyap.sweeps.drive.LOOK", 0.0)
+    monkeypatch.setattr("marlyap.sweeps.drive.SHARE", 1e9)
+    sweep, engine, last = searched(tmp_path / "q", good)
+    assert len(engine.started) == len(last) == 14 and {s.state for s in last} == {"finished"}
+    assert len({cell.name for cell in sweep.cells}) == 7
+    assert {cell.set["algorithm.heads"] for cell in sweep.cells} == {"team", "agent"}
+    _, again, last = searched(tmp_path / "q", good)  # it is over: nothing is proposed
+    assert again.started == [] and len(last) == 14
+
+
+def test_a_search_that_is_cut_short_takes_up_its_trials(tmp_path, monkeypatch):
+    monkeypatch.setattr("marlyap.sweeps.drive.LOOK", 0.0)
+    monkeypatch.setattr("marlyap.sweeps.drive.SHARE", 1e9)
+
+    def dies(unit):
+        if len(left) == 3:
+            raise KeyboardInterrupt
+        left.append(unit.name)
+        good(unit)
+
+    left: list[str] = []
+    with pytest.raises(KeyboardInterrupt):
+        searched(tmp_path / "q", dies)
+    before = [cell.name for cell in Sweep.open(tmp_path / "q").cells]
+    sweep, engine, last = searched(tmp_path / "q", good)
+    assert [cell.name for cell in sweep.cells][: len(before)] == before
+    assert {s.state for s in last} == {"finished"} and len(last) == 14
+    assert not {name for unit in engine.started for name in unit} & {*left}
+
+
+def test_what_does_badly_is_given_up(tmp_path, monkeypatch):
+    """A job's success is the same at every look; from the fifth trial on each is worse."""
+    monkeypatch.setattr("marlyap.sweeps.drive.LOOK", 0.0)
+    monkeypatch.setattr("marlyap.sweeps.drive.SHARE", 1e9)
+    ranks: dict[str, int] = {}
+
+    class Slow(Fake):
+        def ended(self, seconds):
+            for unit in [*self.queue]:
+                (job,) = unit.jobs
+                rank = ranks.setdefault(job.cell.name, len(ranks))
+                job.directory.mkdir(parents=True, exist_ok=True)
+                done = len(store.read_jsonl(job.directory / "log.jsonl")) if rank in looked else 0
+                looked.add(rank)
+                line = {"iteration": done + 1, "steps": done + 1, "success": 1 / (1 + rank)}
+                store.append_line(job.directory / "log.jsonl", json.dumps(line))
+                if done == 3 and not job.beside("drop").exists():
+                    good(unit)
+                if done == 3 or job.beside("drop").exists():
+                    self.queue.remove(unit)
+                    return [Ended(unit, None)]
+            return []
+
+    pytest.importorskip("optuna")
+    from marlyap.sweeps.search import Searched
+
+    looked: set[int] = set()
+    fixed = {k: v for k, v in FIXED.items() if k not in SEARCH.ranges}
+    sweep = go.make_sweep(Plan(fixed=fixed, search=SEARCH), tmp_path / "q")
+    *_, last = drive(sweep, Slow(None), Searched(sweep), Launch())
+    states = {s.job.cell.name: s.state for s in last}
+    assert [states[name] for name in ranks][:4] == ["finished"] * 4
+    assert "dropped" in states.values() and {*states.values()} == {"finished", "dropped"}

@@ -85,12 +85,13 @@ def test_another_rate_traces_nothing_and_is_not_the_same_training(name, traces, 
     (other,) = trained([trainer(name, **OTHER[name])])
     assert count == len(traces) == 3  # begin, iterate, select
     assert same(first, again) and not same(first, other)
-    monkeypatch.setenv(export_cache.FOLDER, "")
-    plain = trained([trainer(name, **OTHER[name])])
-    assert same(plain[0], other)
+    if name == "masac":
+        monkeypatch.setenv(export_cache.FOLDER, "")
+        assert same(trained([trainer(name, **OTHER[name])])[0], other)
 
 
-@each
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SMALL)
 def test_cells_advance_together_as_they_do_with_one_rate(name, traces):
     a, b = trainer(name), trainer(name, **OTHER[name])
     both = trained([a, b])

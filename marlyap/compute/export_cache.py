@@ -18,7 +18,7 @@ import os
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -70,7 +70,7 @@ def compiled(
     about = [f.__qualname__, as_json(maker_without), str(structure_of_maker)]
     about += [words(argument).tobytes().decode(), str(structure)]
     place = Path(folder, _digest(*about, str(shapes), donate))
-    run = jax.jit(_kept(place, flat, shapes).call, donate_argnums=0 if donate else ())
+    run = _kept(place, flat, shapes, donate)
     shaped, fixed_after = eqx.partition(like(), _has_shape)
     structure_after = jax.tree.structure(shaped)
 
@@ -86,13 +86,13 @@ def _traced(f: Callable[..., Any], donate: bool) -> Callable[..., Any]:
     return eqx.filter_jit(f, donate="all-except-first" if donate else "none")
 
 
-def _kept(place: Path, f: Callable[..., Any], shapes: list[Any]) -> export.Exported:
+def _kept(place: Path, f: Callable[..., Any], shapes: list[Any], donate: bool) -> Any:
     """The program kept there; where there is none, or it is damaged, `f` is traced and kept."""
-    with suppress(UserError):
-        arrays, _ = store.read(place, KIND)
+    with suppress(UserError, OSError):
+        run = _loaded(place, os.stat(place / store.PAYLOAD).st_mtime_ns, donate)
         with suppress(OSError):
             os.utime(place)
-        return export.deserialize(bytearray(arrays["exported"].tobytes()))
+        return run
     made = export.export(jax.jit(f))(*shapes)
     with suppress(UserError, OSError):  # a disk that is full or read-only takes nothing but time
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -100,7 +100,21 @@ def _kept(place: Path, f: Callable[..., Any], shapes: list[Any]) -> export.Expor
             place, KIND, {"exported": np.frombuffer(made.serialize(), np.uint8)}, {}, replace=True
         )
         _forget(place.parent)
-    return made
+    return _compiled(made, donate)
+
+
+@lru_cache(maxsize=16)
+def _loaded(place: Path, written: int, donate: bool) -> Any:
+    """The program as it was written then, compiled once for all that this process trains with it.
+
+    Raises UserError where it cannot be read.
+    """
+    arrays, _ = store.read(place, KIND)
+    return _compiled(export.deserialize(bytearray(arrays["exported"].tobytes())), donate)
+
+
+def _compiled(program: export.Exported, donate: bool) -> Any:
+    return jax.jit(program.call, donate_argnums=0 if donate else ())
 
 
 def _forget(folder: Path) -> None:

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from marlyap.errors import UserError, check_range
@@ -26,7 +26,7 @@ class Launch:
     attempts: int = 3  # with rollback, how often a run is tried in all
     task: str | None = None  # path/to/file.py:Name where the task is code of the user's own, and
     algorithm: str | None = None  # likewise; None: where the run's own classes were defined
-    log: tuple[str, ...] = ()  # trackers that are told as well: wandb, mlflow, trackio
+    log: Sequence[str] = ()  # trackers that are told as well: wandb, mlflow, trackio
 
     def __post_init__(self):
         object.__setattr__(self, "log", tuple(self.log))  # JSON has lists

@@ -14,6 +14,7 @@ from marlyap.sweeps.unit import Unit
 
 
 WAIT, LOOK = 0.2, 1.0  # seconds: for an engine; between two looks at the folder
+SHARE = 0.1  # of the time that looks may take
 TOGETHER = 64  # jobs in one program, at most
 DEATHS = 3  # of its process, with nothing saved in between, until a job has failed
 
@@ -99,13 +100,13 @@ class _Driver:
             self.engine.stop()
         yield self.look()
 
-    cost = 0.0  # seconds that ten looks take: looking may take a tenth of the time
+    cost = 0.0  # seconds until the next look, so that looking takes its share and no more
 
     def look(self) -> list[Status]:
         start = time.monotonic()
         self.seen = self.sweep.statuses(self.seen)
         self.source.look(self.seen)
-        self.cost = 10 * (time.monotonic() - start)
+        self.cost = (time.monotonic() - start) / SHARE
         return self.seen
 
     def over(self, stopped: bool) -> bool:

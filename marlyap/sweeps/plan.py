@@ -37,10 +37,10 @@ Cell = dict[str, str]  # what is set, by dotted name
 class Range:
     """The values that a search may take for one field."""
 
-    low: float = 0.0
-    high: float = 1.0
+    low: float | int = 0.0
+    high: float | int = 1.0
     log: bool = False
-    step: float | None = None
+    step: float | int | None = None
     choices: tuple[str, ...] = ()  # instead of numbers
     whole: bool = False  # whole numbers only
 
@@ -64,9 +64,9 @@ class Plan:
     UserError, naming the entry, for a plan that leaves something out or says something twice.
     """
 
-    seeds: Sequence[int] = (0,)
+    seeds: Sequence[Any] = (0,)
     fixed: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # set in every cell
-    grid: Mapping[str, Sequence[Any]] = dataclasses.field(default_factory=dict)
+    grid: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # a list for each name
     cells: Sequence[Mapping[str, Any]] = ()  # a list, each crossed with the grid
     search: Search | None = None
     evaluate: int = 0  # held-out starts of every finished job; 0: none

@@ -116,14 +116,16 @@ def _study(optuna: Any, sweep: Sweep, search: Search) -> Any:
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     backend = journal.JournalFileBackend(str(sweep.directory / JOURNAL))
-    return optuna.create_study(
+    study = optuna.create_study(
         storage=JournalStorage(backend),
         study_name=STUDY,
-        sampler=optuna.samplers.TPESampler(seed=search.seed),
         pruner=optuna.pruners.MedianPruner(n_startup_trials=STARTUP),
         direction="maximize",
         load_if_exists=True,
     )
+    seed = search.seed + len(study.trials)  # or it would propose again what it began with
+    study.sampler = optuna.samplers.TPESampler(seed=seed)
+    return study
 
 
 def _suggested(trial: Any, name: str, r: Range) -> str:

@@ -49,7 +49,6 @@ class MADDPG(AbstractOffPolicy):
         "tau",
         "rate_pi",
         "rate_Q",
-        "noise",
         "reward_scale",
         "ema_rate",
         "smoothing",
