@@ -33,7 +33,7 @@ seeds = [0, 1]
 [fixed]
 "task.agents" = 2
 "task.horizon" = 10
-"schedule.steps" = 12_000
+"schedule.steps" = 6_000
 "schedule.environments" = 4
 "schedule.steps_per_update" = 1
 "schedule.warmup" = 100

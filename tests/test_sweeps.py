@@ -2,10 +2,12 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ from marlyap.runs.job import Launch
 from marlyap.runs.run import Run
 from marlyap.storage import store
 from marlyap.sweeps import go, plan as plans, table
+from marlyap.sweeps.check import checked
 from marlyap.sweeps.drive import DEATHS, Listed, drive
 from marlyap.sweeps.engine import Ended
 from marlyap.sweeps.folder import Sweep
@@ -95,6 +98,16 @@ def test_a_file_that_is_no_plan_is_named(tmp_path):
             plans.of_toml(tmp_path / "bad.toml")
     with pytest.raises(UserError, match="cannot be read"):
         plans.of_toml(tmp_path / "none.toml")
+
+
+def test_the_plans_of_the_page_can_be_trained():
+    page = (Path(__file__).parents[1] / "docs" / "sweeps.md").read_text()
+    blocks = re.findall(r"^```toml\n(.*?)^```", page, re.S | re.M)
+    whole = [block for block in blocks if block.startswith("task")]
+    assert len(whole) == 2 and len(checked(of_data(tomllib.loads(whole[0])))) == 4
+    for block in blocks:
+        text = block if block in whole else f'task = "rendezvous"\nalgorithm = "masac"\n{block}'
+        checked(of_data(tomllib.loads(text)))
 
 
 @pytest.mark.parametrize("a, b", [("1e-3", "0.001"), ("1e5", "100_000"), ("2.0,2", "2,2.0")])
@@ -214,6 +227,8 @@ def test_another_plan_keeps_the_runs_and_nothing_else_is_overwritten(tmp_path):
 
 def test_status_and_table_need_no_jax(tmp_path):
     sweep = made(tmp_path / "q")
+    (sweep.directory / "c0").mkdir()
+    (sweep.directory / "c0" / "seed1.failed").write_text("J_Q: it diverged.\n")
     code = f"""
 import sys
 from marlyap.cli import main
@@ -221,7 +236,8 @@ codes = [main(["sweep", verb, {str(sweep.directory)!r}]) for verb in ("status", 
 print(codes, {{"jax", "equinox", "pandas", "optuna", "ray", "submitit"}} & {{*sys.modules}})
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[0, 0] set()" and "6 waiting" in done.stderr
+    assert done.stdout.strip() == "[0, 0] set()" and "5 waiting, 1 failed" in done.stderr
+    assert "c0/seed1: J_Q: it diverged." in done.stderr
     assert (sweep.directory / "table.csv").read_text().count("\n") == 7
 
 
@@ -306,10 +322,14 @@ def test_a_unit_is_one_line(tmp_path):
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A sweep whose jobs were trained here, a cell of it with a task that cannot be played."""
-    cells = ({"algorithm.rate_Q": "0.001"}, {"algorithm.rate_Q": "0.003"})
+    """A sweep whose jobs were trained here."""
+    cells = ({"algorithm.rate_pi": "0.001"}, {"algorithm.rate_pi": "0.003"})
+    fixed = {
+        k: v for k, v in SMALL.items() if k not in ("algorithm.critic_width", "algorithm.batch")
+    }
+    fixed |= {"task": "rendezvous", "algorithm": "apg"}  # compiled in a fifth of the time of masac
     sweep = go.make_sweep(
-        Plan(fixed=FIXED, cells=cells, seeds=(5,), evaluate=10), tmp_path_factory.mktemp("s") / "q"
+        Plan(fixed=fixed, cells=cells, seeds=(5,), evaluate=10), tmp_path_factory.mktemp("s") / "q"
     )
     for job in sweep.jobs:
         train(Unit((job,), Launch(), sweep.plan.evaluate), lambda: False)
@@ -320,7 +340,7 @@ def test_a_job_is_the_run_that_train_makes(trained, tmp_path):
     for job, seen in zip(trained.jobs, trained.statuses(), strict=True):
         assert seen.state == "finished" and not job.beside("failed").exists()
         run = Run.open(job.directory)
-        words = ["rendezvous", "masac", "--seeds", "5", "--out", str(tmp_path / job.cell.name)]
+        words = ["rendezvous", "apg", "--seeds", "5", "--out", str(tmp_path / job.cell.name)]
         fields = [w for k, v in job.cell.set.items() if "." in k for w in (f"--{k}", v)]
         if job is trained.jobs[1]:  # one is enough: each costs a compilation
             assert main(["train", *words, *fields]) == 0
@@ -342,9 +362,9 @@ def test_a_finished_job_is_left_alone(trained):
 
 def test_tables_and_curves_are_columns(trained):
     rows, curves = trained.table(), trained.curves()
-    assert list(rows["algorithm.rate_Q"]) == [0.001, 0.003]
+    assert list(rows["algorithm.rate_pi"]) == [0.001, 0.003]
     assert all(0 <= x <= 1 for x in rows["held_out"])
-    assert {*curves["metric"]} >= {"J_Q", "success", "return"}
+    assert {*curves["metric"]} >= {"J_pi", "success", "return"}
     run = Run.open(trained.jobs[0].directory)
     one = run.curves()
     assert list(one["steps"]) == [line["steps"] for line in run.history()]

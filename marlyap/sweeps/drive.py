@@ -152,13 +152,19 @@ class _Driver:
             now = status(job)
             if now.state in OVER or stopped:
                 continue
-            if ended.says:
-                count, at = self.deaths.get(job.name, (0, -1))
-                count = count + 1 if now.iteration <= at else 1
-                self.deaths[job.name] = (count, now.iteration)
-                if count >= DEATHS:
-                    says = f"{job.directory}: {ended.says}, {count} times in a row.\n"
-                    job.directory.parent.mkdir(parents=True, exist_ok=True)
-                    store.write_text_atomic(job.beside("failed"), says)
-                    continue
-            self.again.append((time.monotonic() + (LOOK if not ended.says else 0.0), job))
+            if now.state == "running":  # by somebody else
+                self.again.append((time.monotonic() + LOOK, job))
+            elif self._gets_nowhere(now):
+                what = ended.says or "its process did not train it"
+                job.directory.parent.mkdir(parents=True, exist_ok=True)
+                says = f"{job.directory}: {what}, {DEATHS} times in a row.\n"
+                store.write_text_atomic(job.beside("failed"), says)
+            else:
+                self.ready.append(job)
+
+    def _gets_nowhere(self, now: Status) -> bool:
+        """Whether it ended early DEATHS times in a row, no further than the time before."""
+        count, at = self.deaths.get(now.job.name, (0, -1))
+        count = count + 1 if now.iteration <= at else 1
+        self.deaths[now.job.name] = (count, now.iteration)
+        return count >= DEATHS

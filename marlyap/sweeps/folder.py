@@ -27,7 +27,7 @@ from marlyap.sweeps.plan import Plan
 
 @dataclass
 class Sweep:
-    """A folder with a plan and its jobs. Make it with `make` or `open`."""
+    """A folder with a plan and its jobs: what `make_sweep` returns, or `Sweep.open(folder)`."""
 
     directory: Path
     plan: Plan

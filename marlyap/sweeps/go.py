@@ -69,8 +69,10 @@ def run_sweep(
         from marlyap.sweeps.search import Searched
 
         source = Searched(sweep)
-    engine = engine_of(on, sweep, slots, options)
-    yield from drive(sweep, engine, source, how or Launch(), stop, retry)
+    how = how or Launch()
+    one = on == "local" and how.device == "gpu"  # the jobs of a machine share its device
+    engine = engine_of(on, sweep, slots or (1 if one else None), options)
+    yield from drive(sweep, engine, source, how, stop, retry)
 
 
 def engine_of(

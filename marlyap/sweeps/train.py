@@ -45,14 +45,15 @@ def _together(opened: list[tuple[Job, Run]], unit: Unit, stop: Callable[[], bool
     given_up = lambda: all(job.beside("drop").exists() for job, _ in opened)
     by_place = {str(run.directory): job for job, run in opened}
     runs = [run for _, run in opened if not run.finished]
+    told = False
     try:
         for event in together(runs, unit.how, lambda: stop() or given_up()):
             if isinstance(event, events.Failed):
+                told = True
                 _fail(by_place[event.run], event.says)
     except Exception as error:  # whatever the code of a user's task may raise
-        for job in by_place.values():
-            if not isinstance(error, UserError) or len(by_place) == 1:
-                _fail(job, _sentence(error))
+        for run in runs if not told else ():  # else it repeats what was told
+            _fail(by_place[str(run.directory)], _sentence(error))
 
 
 def run_of(job: Job) -> Run:
