@@ -366,6 +366,8 @@ def test_tables_and_curves_are_columns(trained):
     assert all(0 <= x <= 1 for x in rows["held_out"])
     assert {*curves["metric"]} >= {"J_pi", "success", "return"}
     run = Run.open(trained.jobs[0].directory)
+    names = {path.name.partition(".")[0] for path in run.directory.iterdir()}
+    assert names >= {"log", "events"} and (run.directory / "log.csv").is_file()
     one = run.curves()
     assert list(one["steps"]) == [line["steps"] for line in run.history()]
     assert np.isnan(np.asarray(one["success"], float)).any()

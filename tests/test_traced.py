@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import same
 
-from marlyap import Launch, Run, Schedule, Trainer, UserError, launch
+from marlyap import Schedule, Trainer, UserError
 from marlyap.compute import export_cache
 from marlyap.games.dynamics import SingleIntegrator
 from marlyap.learning.algorithms import ALGORITHMS, APG, MASAC
@@ -104,15 +104,3 @@ def test_cells_advance_together_as_they_do_with_one_rate(name, traces):
 def test_runs_of_different_programs_do_not_advance_together():
     with pytest.raises(UserError, match="differ in more than numbers"):
         stacked([trainer(), trainer(batch=8)])
-
-
-def test_a_run_has_its_curves_and_its_files(tmp_path):
-    runs = [
-        Run.create(tmp_path / f"seed{k}", trainer("apg", rate_pi=rate), k, {})
-        for k, rate in enumerate((1e-3, 3e-3))
-    ]
-    [*_] = launch(runs, Launch(parallel="vmap"))
-    for run in runs:
-        assert run.finished and list(run.curves()["steps"]) == [8, 16, 24]
-        names = {p.name.partition(".")[0] for p in run.directory.iterdir()}
-        assert names >= {"log", "events"} and (run.directory / "log.csv").is_file()
