@@ -14,6 +14,7 @@ from marlyap.cli import (
     plot,
     recheck,
     report,
+    sweep,
     train,
     watch,
 )
@@ -52,6 +53,7 @@ class Verb(Protocol):
 VERBS: dict[str, Verb] = {
     "demo": demo,
     "train": train,
+    "sweep": sweep,
     "evaluate": evaluate,
     "bench": bench,
     "certify": certify,

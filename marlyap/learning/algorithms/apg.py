@@ -46,6 +46,8 @@ class APG(AbstractAlgorithm):
     # 1,500 updates on 128 episodes each: playing is cheap where no critic is to be learnt.
     default_schedule = Schedule(steps=7_680_000, environments=128, select_every=50)
 
+    traced = ("rate_pi", "sharpness", "clip", "ema_rate", "weight", "decrease")
+
     rate_pi: float = 2e-3  # learning rate
     actor_width: int = 64  # units in each of two hidden layers
     shared: bool = False  # one set of actor weights for all agents of a kind
