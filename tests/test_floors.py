@@ -35,6 +35,7 @@ FLOORS = """
     conformance
     runs
     report
+    deploy
     cli
     __main__
 """.split()

@@ -10,10 +10,12 @@ from marlyap.cli import (
     check_task,
     demo,
     evaluate,
+    export,
     listing,
     recheck,
     report,
     train,
+    verify,
     watch,
 )
 from marlyap.cli.common import Overrides, Result
@@ -56,6 +58,8 @@ VERBS: dict[str, Verb] = {
     "certify": certify,
     "recheck": recheck,
     "check-task": check_task,
+    "export": export,
+    "verify": verify,
     "report": report,
     "watch": watch,
     "list": listing,

@@ -136,6 +136,9 @@ class Perturbed(AbstractRegulation):
     def observation_entries(self):
         return self.inner.observation_entries()
 
+    def sight(self):
+        return self.inner.sight()
+
     def step(self, state, action):
         queue = jnp.concatenate([state.memory["queue"], action[None]])
         now, key = queue[0], jax.random.fold_in(self._key(state, 2), state.t)
