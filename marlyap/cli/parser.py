@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from marlyap.cli import (
+    agent,
     bench,
     certify,
     check_task,
@@ -14,6 +15,7 @@ from marlyap.cli import (
     listing,
     recheck,
     report,
+    swarm,
     train,
     verify,
     watch,
@@ -60,6 +62,8 @@ VERBS: dict[str, Verb] = {
     "check-task": check_task,
     "export": export,
     "verify": verify,
+    "agent": agent,
+    "swarm": swarm,
     "report": report,
     "watch": watch,
     "list": listing,

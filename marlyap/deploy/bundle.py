@@ -19,6 +19,7 @@ from marlyap.simulation.rollout import Decentralised
 from marlyap.storage import hashing, store
 
 
+KEPT = 100  # starts that a bundle holds, for its swarm
 OWN_AGE, NEIGHBOUR_AGE = 2, 3  # periods after which what is known counts as old
 
 Tell = Callable[[str], None]
@@ -51,12 +52,12 @@ def write(
     found = check.agreement(body, pairs, check.by_numpy(body, arrays))
     if found.fault:
         raise UserError(f"export: the NumPy runtime disagrees with JAX: {found.fault}.")
-    begun = drawn(there, controller, max(starts, 1)) if body["sight"] else None
+    begun = drawn(there, controller, max(starts, KEPT)) if body["sight"] else None
     body["evidence"] = evidence(there, controller, starts, tell)
     body |= margins(body, arrays, begun if starts else None, tell)
     files = {WEIGHTS: store.packed(arrays), GOLDEN: store.packed(pairs)}
     if begun is not None:
-        files[STARTS] = store.packed(begun.first(100)._asdict())
+        files[STARTS] = store.packed(begun.first(KEPT)._asdict())
     files |= runtime_files(body, arrays, runtimes, tell)
     whole = files | {contracts.CONTRACT: contracts.sealed(body, files)}
     store.write_folder(out, {name: [raw] for name, raw in whole.items()})
