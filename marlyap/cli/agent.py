@@ -23,6 +23,8 @@ def options(p: ArgumentParser) -> None:
     ends = "zenoh endpoints, such as tcp/0.0.0.0:7601"
     p.add_argument("--listen", nargs="+", default=[], metavar="END", help=ends)
     p.add_argument("--connect", nargs="+", default=[], metavar="END", help="those of others")
+    ros = "meet ROS 2 over rmw_zenoh's keys in this domain (not tried on a robot)"
+    p.add_argument("--ros", type=number, default=None, metavar="DOMAIN", help=ros)
     p.add_argument("--end-with-input", action="store_true", help="end when standard input does")
     ways(p)
 
@@ -45,7 +47,7 @@ def run(args: Namespace, overrides: Overrides) -> Result:
 
     from marlyap.deploy import contract as contracts, wire
     from marlyap.deploy.agent import Agent, Ways
-    from marlyap.deploy.bus import ZenohBus
+    from marlyap.deploy.bus import Bus, ZenohBus
     from marlyap.deploy.runtime import Role
 
     contract = contracts.load(args.bundle)
@@ -54,7 +56,11 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     how = Ways(args.lock, args.wait, args.silent, args.loss, args.delay, args.jitter, args.seed)
     team = wire.team_name(args.team or contract["sha256"][:12])
     robot, ended = Role.load(args.bundle, args.role), threading.Event()
-    bus = ZenohBus(args.listen, args.connect)
+    bus: Bus = ZenohBus(args.listen, args.connect)
+    if args.ros is not None:
+        from marlyap.deploy.ros2 import RosBus
+
+        bus = RosBus(bus, contract, args.role, args.ros)
     if args.end_with_input:
         threading.Thread(target=_wait_for_end, args=(ended,), daemon=True).start()
     try:

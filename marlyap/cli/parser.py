@@ -6,6 +6,7 @@ from typing import Protocol
 
 from marlyap.cli import (
     agent,
+    bag,
     bench,
     certify,
     check_task,
@@ -64,6 +65,7 @@ VERBS: dict[str, Verb] = {
     "verify": verify,
     "agent": agent,
     "swarm": swarm,
+    "bag": bag,
     "report": report,
     "watch": watch,
     "list": listing,

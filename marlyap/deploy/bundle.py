@@ -9,8 +9,9 @@ import numpy as np
 
 from marlyap.deploy import c_source, check, contract as contracts, express, golden, onnx_graph
 from marlyap.deploy.contract import GOLDEN, HEADER, RUNTIME, RUNTIMES, SOURCE, STARTS, WEIGHTS
+from marlyap.deploy.extras import needs
 from marlyap.deploy.margins import Margins, measured
-from marlyap.deploy.starts import Starts, drawn
+from marlyap.deploy.starts import Starts, of as starts_of, played
 from marlyap.errors import UserError, check_range
 from marlyap.games.game import AbstractGame
 from marlyap.runs.run import Run
@@ -43,18 +44,21 @@ def write(
     check_range("starts", starts, 0, 100_000)
     if out.exists():
         raise UserError(f"out: {out} already exists; choose another folder.")
+    if "onnx" in runtimes:
+        needs("onnx", "export --with onnx")
     there = run.game if game is None else game
     controller = run.controller(there)
     arrays, nets = express.networks(express.actors(controller.policy), there.agents)
     body = described(run, there, controller, nets)
     tell("golden pairs ...")
-    pairs = golden.pairs(there, controller, body)
+    episodes = played(there, controller, max(starts, KEPT, golden.PAIRS))
+    pairs = golden.pairs(there, controller, body, episodes.way)
     found = check.agreement(body, pairs, check.by_numpy(body, arrays))
     if found.fault:
         raise UserError(f"export: the NumPy runtime disagrees with JAX: {found.fault}.")
-    begun = drawn(there, controller, max(starts, KEPT)) if body["sight"] else None
+    begun = starts_of(there, episodes) if body["sight"] else None
     body["evidence"] = evidence(there, controller, starts, tell)
-    body |= margins(body, arrays, begun if starts else None, tell)
+    body |= margins(body, arrays, begun.first(starts) if begun and starts else None, tell)
     files = {WEIGHTS: store.packed(arrays), GOLDEN: store.packed(pairs)}
     if begun is not None:
         files[STARTS] = store.packed(begun.first(KEPT)._asdict())

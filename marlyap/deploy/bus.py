@@ -3,8 +3,9 @@
 A key is words joined by slashes; in a pattern `*` stands for any one word.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 from marlyap.deploy.extras import needs
 
@@ -13,28 +14,28 @@ Listener = Callable[[str, bytes], None]  # key, payload
 Watcher = Callable[[str, bool], None]  # key, whether its owner is there
 
 
-class Bus(Protocol):
+class Bus(ABC):
     """Listeners may be called in threads of the bus; they must return at once."""
 
+    @abstractmethod
     def put(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
         """Send to all who listen."""
-        ...
 
+    @abstractmethod
     def on(self, pattern: str, listener: Listener) -> None:
         """Call the listener with all that is sent from now on."""
-        ...
 
+    @abstractmethod
     def alive(self, key: str) -> None:
         """Say that the owner of the key is there, until this bus is closed or its process dies."""
-        ...
 
+    @abstractmethod
     def watch(self, pattern: str, watcher: Watcher) -> None:
         """Call the watcher for all owners that are there, that come and that go."""
-        ...
 
+    @abstractmethod
     def close(self) -> None:
         """Leave."""
-        ...
 
 
 def matches(pattern: str, key: str) -> bool:
@@ -52,7 +53,7 @@ class Hub:
         self.buses: list[LocalBus] = []
 
 
-class LocalBus:
+class LocalBus(Bus):
     """A bus within one process: delivers at once, in the caller's thread."""
 
     def __init__(self, hub: Hub):
@@ -92,7 +93,7 @@ class LocalBus:
                     watcher(key, there)
 
 
-class ZenohBus:
+class ZenohBus(Bus):
     """Eclipse zenoh between peers, without multicast: who connects to whom is told.
 
     Arguments: listen and connect, endpoints such as tcp/127.0.0.1:7601; those that do not answer

@@ -3,7 +3,6 @@
 Whether a number is finite is read off its bits, since -ffast-math lets a compiler drop `isfinite`.
 """
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -173,13 +172,13 @@ Returns 1 where the command is the fallback. contract.json has names, units and 
 """
 
 
-def number(x: float) -> str:
+def number(x: Any) -> str:
     """A float as C has it, which reads back as the same one."""
     text = f"{np.float32(x):.9g}"
     return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
 
 
-def _listed(values: Iterable[float]) -> str:
+def _listed(values: Any) -> str:
     return ", ".join(map(number, values))
 
 

@@ -13,9 +13,8 @@ import numpy as np
 
 from marlyap.deploy import express
 from marlyap.games.game import AbstractGame
-from marlyap.seeds import stream
-from marlyap.simulation.rollout import Decentralised, rollout
-from marlyap.types import Key, State
+from marlyap.simulation.rollout import Decentralised
+from marlyap.types import State
 
 
 PAIRS = 192  # for each robot, a fourth of them with a fault
@@ -23,14 +22,6 @@ FAULTS = 48
 ANY = 1.5  # how far states may lie from those that were played, in their spread
 
 Arrays = dict[str, np.ndarray]
-
-
-@eqx.filter_jit
-def _played(game: AbstractGame, controller: Decentralised, keys: Key) -> State:
-    """One state of each episode: the k-th is seen after k steps."""
-    paths = jax.vmap(lambda k: rollout(game, controller, game.reset(k), k))(keys).state
-    n = jnp.arange(keys.shape[0])
-    return jax.tree.map(lambda leaf: leaf[n, n % (game.horizon + 1)], paths)
 
 
 @eqx.filter_jit
@@ -46,14 +37,14 @@ def _decided(
     return jax.vmap(one)(states, links)
 
 
-def drawn(game: AbstractGame, controller: Decentralised, count: int, seed: int) -> dict[str, Any]:
-    """`count` states that the team comes through, with neighbours missing at random.
+def drawn(
+    game: AbstractGame, controller: Decentralised, states: State, seed: int
+) -> dict[str, Any]:
+    """These states [episode], links that are missing at random, what is seen and done there.
 
     Robots in the plane are moved at random from there, since a bundle has to be right anywhere.
     """
-    rng = np.random.default_rng(seed)
-    keys = jax.random.split(jax.random.fold_in(stream(0, "select"), seed), count)
-    states = _played(game, controller, keys)
+    rng, count = np.random.default_rng(seed), states.t.shape[0]
     if express.sight(game) is not None:
         x = np.asarray(states.x)
         far = ANY * np.maximum(x.std(axis=(0, 1)), 0.5) * rng.standard_normal(x.shape)
@@ -101,7 +92,8 @@ def spoilt(given: Arrays, contract: dict[str, Any], leads: bool) -> Arrays:
             given["told"][k] = n % 2
             given["goal"][k, n // 2 % 2] = value
         elif robots and given["present"].shape[1]:
-            slot = n % given["present"].shape[1]
+            absent = np.flatnonzero(given["present"][k] == 0)
+            slot = absent[0] if n % 2 and len(absent) else n % given["present"].shape[1]
             due = bool(given["present"][k, slot])  # what is absent may hold anything
             given["neighbours"][k, slot, n % given["neighbours"].shape[2]] = value
         else:
@@ -122,9 +114,11 @@ def _brake(contract: dict[str, Any], own: np.ndarray) -> np.ndarray:
     return np.array([max(-m, min(m, u)) for u, m in zip(asked, limits, strict=True)], np.float32)
 
 
-def pairs(game: AbstractGame, controller: Decentralised, contract: dict[str, Any]) -> Arrays:
-    """All golden pairs, as `agent_0.own` and so on."""
-    found = drawn(game, controller, PAIRS, seed=1)
+def pairs(
+    game: AbstractGame, controller: Decentralised, contract: dict[str, Any], states: State
+) -> Arrays:
+    """All golden pairs, as `agent_0.own` and so on, from the first PAIRS of these states."""
+    found = drawn(game, controller, jax.tree.map(lambda leaf: leaf[:PAIRS], states), seed=1)
     arrays = {}
     for i, role in enumerate(contract["roles"]):
         given = spoilt(inputs(game, found, i), contract, bool(role.get("leads")))

@@ -4,13 +4,16 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
 from marlyap.seeds import stream
 from marlyap.simulation.evaluation import episode
 from marlyap.simulation.rollout import Decentralised
+from marlyap.types import Key, Keys, State
 
 
 class Starts(NamedTuple):
@@ -24,24 +27,38 @@ class Starts(NamedTuple):
         return Starts(*(part[:count] for part in self))
 
 
-def drawn(game: AbstractGame, controller: Decentralised, episodes: int) -> Starts:
-    """The starts that `evaluate` draws with seed 0 for so many episodes, and how they end.
+class Played(NamedTuple):
+    """States of evaluation episodes: the first, one on the way, and the last."""
+
+    first: State
+    way: State  # of the k-th episode, after k steps, modulo its horizon
+    last: State
+
+
+@eqx.filter_jit
+def _played(game: AbstractGame, controller: Decentralised, keys: Keys) -> Played:
+    n = jnp.arange(keys.shape[0]) % (game.horizon + 1)
+
+    def one(key: Key, k: Int[Array, ""]) -> Played:
+        states = episode(game, controller, key).state
+        return Played(*(jax.tree.map(lambda leaf: leaf[at], states) for at in (0, k, -1)))
+
+    return jax.vmap(one)(keys, n)
+
+
+def played(game: AbstractGame, controller: Decentralised, episodes: int) -> Played:
+    """So many of the episodes that `evaluate` plays with seed 0."""
+    return _played(game, controller, jax.random.split(stream(0, "evaluate"), episodes))
+
+
+def of(game: AbstractGame, states: Played) -> Starts:
+    """Where these episodes of a planar game begin and end.
 
     Raises UserError where goals move, which no bundle can express.
     """
-
-    @eqx.filter_jit
-    def played(controller, keys):
-        def one(key):
-            path = episode(game, controller, key)
-            first, last = (jax.tree.map(lambda leaf, k=k: leaf[k], path.state) for k in (0, -1))
-            goals = game.goals  # pyright: ignore[reportAttributeAccessIssue] -- a planar game
-            return first.x, goals(first), goals(last), game.distance(last)
-
-        return jax.vmap(one)(keys)
-
-    keys = jax.random.split(stream(0, "evaluate"), episodes)
-    x, goal, later, final = map(np.asarray, played(controller, keys))
+    goals = jax.vmap(game.goals)  # pyright: ignore[reportAttributeAccessIssue] -- of planar games
+    goal, later = np.asarray(goals(states.first)), np.asarray(goals(states.last))
     if not np.array_equal(goal, later):
         raise UserError("export: the goals of this task move, which a bundle cannot express yet.")
-    return Starts(x, goal, final)
+    final = np.asarray(jax.vmap(game.distance)(states.last))
+    return Starts(np.asarray(states.first.x), goal, final)
