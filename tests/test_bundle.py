@@ -12,8 +12,8 @@ import pytest
 from marlyap.cli import main
 from marlyap.deploy import bundle, c_source, check, contract as contracts, golden, margins, verify
 from marlyap.deploy.contract import CONTRACT, GOLDEN, RUNTIME, SOURCE, STARTS, WEIGHTS
-from marlyap.deploy.plant import MOTIONS, coasted, step
 from marlyap.deploy.margins import allowed, conditions
+from marlyap.deploy.plant import MOTIONS, coasted, step
 from marlyap.deploy.runtime import Role, read_arrays
 from marlyap.deploy.starts import played
 from marlyap.errors import UserError
@@ -220,7 +220,9 @@ def test_another_weight_in_c_is_found(copy, capsys):
     text = (copy / SOURCE).read_text()
     head, _, tail = text.partition("net1_1_bias[16] = {\n")
     old, _, rest = tail.partition(",")
-    resealed(copy, controller__c=f"{head}net1_1_bias[16] = {{\n{float(old[:-1]) + 0.5}f,{rest}".encode())
+    resealed(
+        copy, controller__c=f"{head}net1_1_bias[16] = {{\n{float(old[:-1]) + 0.5}f,{rest}".encode()
+    )
     assert main(["verify", str(copy), "--with", "c"]) == 1
     assert "agent_1 differs in pair" in capsys.readouterr().out
 
@@ -267,9 +269,7 @@ CASES = {
     "rk4": Rendezvous(agents=2, horizon=4, dynamics=DYNAMICS["unicycle"]),
 }
 FAST: set[str] = set()
-every_case = [
-    pytest.param(k, marks=[] if k in FAST else [pytest.mark.slow]) for k in CASES
-]
+every_case = [pytest.param(k, marks=[] if k in FAST else [pytest.mark.slow]) for k in CASES]
 
 
 @pytest.mark.parametrize("name", every_case)
@@ -318,7 +318,21 @@ def test_margins_and_the_delay_that_follows(small_run, tmp_path, monkeypatch, ca
     some = lambda c: [row for row in conditions(c) if any(word in row[0] for word in kept)]
     monkeypatch.setattr(margins, "conditions", some)
     out = tmp_path / "bundle"
-    assert main(["export", str(small_run.directory), "--out", str(out), "--with", "numpy", "--starts", "20"]) == 0
+    assert (
+        main(
+            [
+                "export",
+                str(small_run.directory),
+                "--out",
+                str(out),
+                "--with",
+                "numpy",
+                "--starts",
+                "20",
+            ]
+        )
+        == 0
+    )
     contract = contracts.load(out)
     assert contract["evidence"]["success"]["episodes"] == 20
     rows = {row["what"]: row for row in contract["margins"]}
@@ -354,7 +368,16 @@ def test_bad_words(small_bundle, small_run, tmp_path, capsys):
 
 def test_without_onnx_the_mend_is_said(small_run, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "onnx", None)
-    words = ["export", str(small_run.directory), "--out", str(tmp_path / "b"), "--with", "onnx", "--starts", "0"]
+    words = [
+        "export",
+        str(small_run.directory),
+        "--out",
+        str(tmp_path / "b"),
+        "--with",
+        "onnx",
+        "--starts",
+        "0",
+    ]
     assert main(words) == 2
     assert "pip install 'marlyap[robots]'" in capsys.readouterr().err
 
@@ -365,7 +388,8 @@ sys.modules.update(dict.fromkeys(("jax", "jaxlib", "equinox", "jaxtyping", "onnx
 from marlyap.cli import main
 bundle = sys.argv[1]
 codes = [main(["verify", bundle, "--with", *sys.argv[2:]])]
-codes.append(main(["swarm", bundle, "--bus", "local", "--episodes", "1", "--lock", "--out", "film"]))
+words = "--bus local --episodes 1 --lock --out film"
+codes.append(main(["swarm", bundle, *words.split()]))
 sys.exit(any(codes))
 """
 

@@ -50,6 +50,9 @@ class Ways:
             raise UserError(f"silent: '{self.silent}' must be hold or absent.")
 
 
+AS_TRAINED = Ways()
+
+
 class Agent:
     """A robot on a bus. Call `poll` when something has come, or at the time it asks for.
 
@@ -62,7 +65,7 @@ class Agent:
         robot: Role,
         bus: Bus,
         team: str,
-        ways: Ways = Ways(),
+        ways: Ways = AS_TRAINED,
         clock: Callable[[], float] = time.monotonic,
     ):
         self.robot, self.bus, self.team, self.ways, self.clock = robot, bus, team, ways, clock
@@ -99,18 +102,20 @@ class Agent:
             self._take(*self.inbox.get())
         now = self.clock()
         self._arrive(now)
-        if self.own is None or _when(self.own[0]) <= self.answered:
-            return min((at for at, _, _ in self.coming), default=None)
+        soon = [at for at, _, _ in self.coming]
+        if self.own is None:
+            return min(soon, default=None)
         packet, arrived = self.own
         if self.told < _when(packet) or (self.ways.lock and now >= self.repeat):
             self._say(wire.MESSAGE, packet, self.robot.message(packet.numbers))
             self.told, self.repeat = _when(packet), now + REPEAT
-        latest = arrived + self.wait
+        latest = self.repeat if self.ways.lock else arrived + self.wait
+        if _when(packet) <= self.answered:
+            return min([latest, *soon]) if self.ways.lock else min(soon, default=None)
         there = all(self._at(name, packet) for name in self.neighbours)
         if there or (not self.ways.lock and now >= latest):
             self._answer(packet, now - arrived, now)
-            return None
-        return min([self.repeat if self.ways.lock else latest, *(at for at, _, _ in self.coming)])
+        return min([latest, *soon])
 
     def run(self, ended: Callable[[], bool] = lambda: False) -> None:
         """Be this robot until the team is stopped, or `ended`, which is asked now and then."""
@@ -137,8 +142,9 @@ class Agent:
         if what == wire.STOP:
             self.stopped = True
             return
-        count = {wire.ODOMETRY: len(self.robot.contract["state"]), wire.GOAL: 2}
-        packet = wire.unpack(payload, count.get(what, self.robot.tells))
+        states, tells = len(self.robot.contract["state"]), self.robot.tells
+        count = {wire.ODOMETRY: states, wire.GOAL: 2, wire.MESSAGE: tells}
+        packet = wire.unpack(payload, count[what])
         if packet is None:
             return
         if what == wire.ODOMETRY:

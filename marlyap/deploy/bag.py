@@ -61,7 +61,9 @@ def recorded(run: Run, game: AbstractGame, number: int, seed: int) -> list[Line]
     path = eqx.filter_jit(episode)(game, run.controller(game), start)
     scene = jax.vmap(game.scene)(path.state)
     u = np.asarray(jax.vmap(game.plant.inputs_of)(path.action))
-    place, velocity, goal = (np.asarray(getattr(scene, k)) for k in ("position", "velocity", "goal"))
+    place, velocity, goal = (
+        np.asarray(getattr(scene, k)) for k in ("position", "velocity", "goal")
+    )
     x, lines = np.asarray(path.state.x), []
     turn = {k: states.index(k) for k in ("psi", "omega") if k in states}
     of = lambda k, t, i: float(x[t, i, turn[k]]) if k in turn else 0.0

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from marlyap.deploy import c_source, check, contract as contracts, express, golden, onnx_graph
 from marlyap.deploy.contract import GOLDEN, HEADER, RUNTIME, RUNTIMES, SOURCE, STARTS, WEIGHTS

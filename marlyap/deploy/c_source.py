@@ -200,7 +200,11 @@ def header(body: dict[str, Any]) -> str:
     told = (ROBOT_HEADER if robots else PLAIN_HEADER) % n
     macros = "".join(f"#define MARLYAP_{k.upper()} {v}\n" for k, v in n.items())
     given = "const float *goal, const float *neighbours,\n    const unsigned char *present, "
-    first = f"const float *own, float age, {given}" if robots else "const float *observation, float age, "
+    first = (
+        f"const float *own, float age, {given}"
+        if robots
+        else "const float *observation, float age, "
+    )
     calls = "".join(f"int marlyap_{r['name']}({first}float *command);\n" for r in body["roles"])
     guard = "MARLYAP_CONTROLLER_H"
     return f"#ifndef {guard}\n#define {guard}\n\n{macros}\n{told}{calls}\n#endif\n"

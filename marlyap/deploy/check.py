@@ -30,7 +30,7 @@ def pairs_of(golden: Arrays, role: str) -> dict[str, np.ndarray]:
 
 
 def agreement(contract: dict[str, Any], golden: Arrays, runtime: Answers) -> Agreement:
-    """Compare a runtime with all golden pairs: commands within TOLERANCE, the fallback where due."""
+    """Compare a runtime with all golden pairs: commands within TOLERANCE, fallbacks where due."""
     limits = np.array([c["limit"] for c in contract["action"]["channels"]])
     count, worst, fault = 0, 0.0, ""
     for role in contract["roles"]:

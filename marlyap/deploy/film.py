@@ -13,9 +13,7 @@ def film(contract: dict[str, Any], played: Episode, number: int) -> Film:
     """One episode, seen from above."""
     roles, heading = contract["roles"], contract["sight"]["heading"]
     index = {r["name"]: r["index"] for r in roles}
-    links = {
-        tuple(sorted((r["index"], index[n]))) for r in roles for n in r["neighbours"] if n
-    }
+    links = {tuple(sorted((r["index"], index[n]))) for r in roles for n in r["neighbours"] if n}
     time, away = len(played.x), distances(played.x, played.goal)
     psi = None if heading is None else played.x[..., heading]
     frames = Frames(

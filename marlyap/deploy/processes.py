@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from marlyap.deploy import wire
-from marlyap.deploy.agent import Ways
+from marlyap.deploy.agent import AS_TRAINED, Ways
 from marlyap.deploy.bus import ZenohBus
 from marlyap.deploy.swarm import Stage
 from marlyap.errors import UserError
@@ -31,7 +31,7 @@ class Processes(Stage):
     Raises UserError where zenoh is missing, or where a robot does not start.
     """
 
-    def __init__(self, bundle: Path, robots: Sequence[str], team: str, ways: Ways = Ways()):
+    def __init__(self, bundle: Path, robots: Sequence[str], team: str, ways: Ways = AS_TRAINED):
         self.bundle, self.team, self.ways = bundle, team, ways
         ports = free_ports(1 + len(robots))
         ends = [f"tcp/127.0.0.1:{port}" for port in ports]

@@ -80,18 +80,18 @@ def decode(kind: str, raw: bytes) -> Message:
     return Message(sec * 10**9 + ns, tuple(frames), np.frombuffer(body, "<f8", offset=at))
 
 
-def key(domain: int, topic: str, kind: str) -> str:
+def topic_key(domain: int, topic: str, kind: str) -> str:
     """The key under which rmw_zenoh says a topic, such as robot/odom."""
     package, _, name = kind.split("/")
     return f"{domain}/{topic}/{package}::msg::dds_::{name}_/RIHS01_{HASHES[kind]}"
 
 
-def attachment(sequence: int, stamp: int, gid: bytes) -> bytes:
+def sender(sequence: int, stamp: int, gid: bytes) -> bytes:
     """What goes with a message: its number, its time (ns), and 16 bytes that name the sender."""
     return struct.pack("<qqB16s", sequence, stamp, 16, gid)
 
 
-def odometry(stamp: int, robot: str, pose: tuple[float, float, float], twist: Any) -> bytes:
+def odometry(stamp: int, robot: str, pose: Any, twist: Any) -> bytes:
     """A nav_msgs/Odometry: pose x, y (m), yaw (rad) in `odom`; twist vx, vy, omega of the body."""
     numbers = np.zeros(85)
     numbers[:2] = pose[:2]
@@ -159,22 +159,28 @@ class RosBus(Bus):
         self.tick, self.stamp, self.count = 0, 0, 0
         self.gid = struct.pack("<16s", robot.encode()[:16])
 
-    def put(self, key_of: str, payload: bytes, attached: bytes | None = None) -> None:
-        if wire.what_of(key_of) != wire.COMMAND:
+    def put(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
+        if wire.what_of(key) != wire.COMMAND:
             return  # neighbours read our odometry, which the robot itself says
         packet = wire.unpack(payload, len(self.inputs))
         assert packet is not None
         topic, kind, raw = command(self.stamp, self.robot, self.inputs, packet.numbers)
         self.count += 1
-        about = attachment(self.count, time.time_ns(), self.gid)
-        self.bus.put(key(self.domain, f"{self.robot}/{topic}", kind), raw, about)
+        about = sender(self.count, time.time_ns(), self.gid)
+        self.bus.put(topic_key(self.domain, f"{self.robot}/{topic}", kind), raw, about)
 
     def on(self, pattern: str, listener: Callable[[str, bytes], None]) -> None:
         robot, what = wire.robot_of(pattern), wire.what_of(pattern)
         if what in (wire.ODOMETRY, wire.MESSAGE):
-            self.bus.on(key(self.domain, f"{robot}/{ODOM_TOPIC}", ODOMETRY), self._odom(pattern, listener))
+            self.bus.on(
+                topic_key(self.domain, f"{robot}/{ODOM_TOPIC}", ODOMETRY),
+                self._odom(pattern, listener),
+            )
         elif what == wire.GOAL:
-            self.bus.on(key(self.domain, f"{robot}/{GOAL_TOPIC}", POINT), self._goal(pattern, listener))
+            self.bus.on(
+                topic_key(self.domain, f"{robot}/{GOAL_TOPIC}", POINT),
+                self._goal(pattern, listener),
+            )
 
     def _odom(self, pattern: str, listener: Callable[[str, bytes], None]) -> Callable[..., None]:
         own = wire.what_of(pattern) == wire.ODOMETRY
@@ -198,7 +204,7 @@ class RosBus(Bus):
 
         return heard
 
-    def alive(self, key_of: str) -> None:
+    def alive(self, key: str) -> None:
         """Tokens of a node and its publisher, as rmw_zenoh has them."""
         self.bus.alive(f"@ros2_lv/{self.domain}/{self.robot}/0/0/NN/%/%/{self.robot}")
 

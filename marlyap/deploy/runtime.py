@@ -12,6 +12,7 @@ import json
 import math
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,9 +28,9 @@ class Role:
     """
 
     def __init__(self, contract, arrays, name):
-        self.contract = contract
-        self.role = next((r for r in contract["roles"] if r["name"] == name), None)
-        if self.role is None:
+        self.contract: dict[str, Any] = contract
+        self.role: dict[str, Any] = next((r for r in contract["roles"] if r["name"] == name), {})
+        if not self.role:
             names = ", ".join(r["name"] for r in contract["roles"])
             raise ValueError(f"role: there is none called {name!r}; there is {names}.")
         net, count = self.role["network"], contract["action"]["layers"]
@@ -120,7 +121,7 @@ class Role:
         out = [x[k] for k in self.rates]
         out.append(1.0 if self.leads else 0.0)
         out += gap(goal[0] - x[0], goal[1] - x[1]) if self.leads else (0.0, 0.0, 0.0, 0.0)
-        for m, present, shift in zip(heard, there, self.shift):
+        for m, present, shift in zip(heard, there, self.shift, strict=True):
             entries = [1.0, *gap(m[0] - x[0] + shift[0], m[1] - x[1] + shift[1])]
             for k in range(2, self.tells, 2):
                 entries += turned(m[k], m[k + 1])
@@ -167,7 +168,7 @@ def columns(array):
 
 def seen_by_one(messages, there, blank):
     """What counts of messages [slot, message], as lists."""
-    return [m if p else blank for m, p in zip(messages.tolist(), there)]
+    return [m if p else blank for m, p in zip(messages.tolist(), there, strict=True)]
 
 
 def seen(messages, present):

@@ -41,7 +41,8 @@ def _played(game: AbstractGame, controller: Decentralised, keys: Keys) -> Played
 
     def one(key: Key, k: Int[Array, ""]) -> Played:
         states = episode(game, controller, key).state
-        return Played(*(jax.tree.map(lambda leaf: leaf[at], states) for at in (0, k, -1)))
+        at = lambda k: jax.tree.map(lambda leaf: leaf[k], states)
+        return Played(at(0), at(k), at(-1))
 
     return jax.vmap(one)(keys, n)
 

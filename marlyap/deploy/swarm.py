@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marlyap.deploy import wire
-from marlyap.deploy.agent import Agent, Ways
+from marlyap.deploy.agent import AS_TRAINED, Agent, Ways
 from marlyap.deploy.bus import Bus, Hub, LocalBus
 from marlyap.deploy.plant import coasted, step
 from marlyap.deploy.runtime import Role
@@ -186,6 +186,7 @@ class Simulator:
         """A period by the clock, in pieces, with the commands that have come by then."""
         pieces = max(1, round(self.period / PIECE))
         dt, plant = self.period / pieces, self.contract["plant"]
+        u = np.zeros((len(x), self.inputs))
         for k in range(pieces):
             at = tick * self.period + k * dt
             self.stage.until(self.start + at)
@@ -233,7 +234,9 @@ def timeline(events: Sequence[Event]) -> Iterator[tuple[float, str, str]]:
 class Together(Stage):
     """All in one process, in a time of its own: for tests, and to try a bundle without zenoh."""
 
-    def __init__(self, robots: list[Role], team: str, ways: Ways = Ways(), hub: Hub | None = None):
+    def __init__(
+        self, robots: list[Role], team: str, ways: Ways = AS_TRAINED, hub: Hub | None = None
+    ):
         self.hub, self.time = hub or Hub(), 0.0
         self.bus, self.team, self.ways = LocalBus(self.hub), team, ways
         self.robots = {r.role["name"]: r for r in robots}

@@ -27,6 +27,9 @@ class Faults:
     dead_from: int = 0  # ... from this period on
 
 
+NONE = Faults()
+
+
 class Ears:
     """What each robot has last heard of each neighbour: [episode, agent, slot, message]."""
 
@@ -44,7 +47,7 @@ class Ears:
         self.oldest = round(timing["max_neighbour_age"] / timing["period"])
 
     def hear(self, sent: np.ndarray, arrives: np.ndarray, late: int) -> None:
-        """Take what was sent [episode, agent, message], where it arrives; it is `late` periods old."""
+        """Take what was sent [episode, agent, message], `late` periods ago, where it arrives."""
         new = arrives & self.exist[None]
         self.age = np.where(new, late, self.age + 1)
         self.message = np.where(new[..., None], sent[:, self.slots], self.message)
@@ -67,7 +70,7 @@ def simulate(
     robots: list[Role],
     x: np.ndarray,
     goal: np.ndarray,
-    faults: Faults = Faults(),
+    faults: Faults = NONE,
     seed: int = 0,
     horizon: int | None = None,
 ) -> np.ndarray:

@@ -64,10 +64,12 @@ int main(void)
     return 0;
 }
 """
-ROBOT_ARRAYS = """    float own[MARLYAP_STATE], age, goal[2], told, heard[%(slots)d], flags[%(slots)d];
+ROBOT_ARRAYS = """
+    float own[MARLYAP_STATE], age, goal[2], told, heard[%(slots)d], flags[%(slots)d];
     unsigned char present[%(slots)d];"""
-ROBOT_READS = """            if (!READ(own, MARLYAP_STATE) || !READ(&age, 1) || !READ(goal, 2) || !READ(&told, 1))
-                return 1;
+ROBOT_READS = """
+            if (!READ(own, MARLYAP_STATE) || !READ(&age, 1)) return 1;
+            if (!READ(goal, 2) || !READ(&told, 1)) return 1;
             if (!READ(heard, MARLYAP_SLOTS * MARLYAP_MESSAGE) || !READ(flags, MARLYAP_SLOTS))
                 return 1;
             for (j = 0; j < MARLYAP_SLOTS; j++) present[j] = flags[j] > 0.5f;"""
@@ -170,7 +172,9 @@ def _onnx(directory: Path) -> Answers:
         wanted = {node.name: node.shape for node in session.get_inputs()}
         named = {**given, "observation": given["own"]}
         rows = {k: np.asarray(named[k], np.float32) for k in wanted}
-        asked = ({k: v[n].reshape(wanted[k]) for k, v in rows.items()} for n in range(len(given["own"])))
+        asked = (
+            {k: v[n].reshape(wanted[k]) for k, v in rows.items()} for n in range(len(given["own"]))
+        )
         pairs = [session.run(["command", "fallback"], ask) for ask in asked]
         return np.stack([u for u, _ in pairs]), np.array([bool(f[0]) for _, f in pairs])
 
@@ -230,7 +234,9 @@ def _run(words: list[str], what: str, given: bytes | None = None) -> bytes:
     except (OSError, subprocess.TimeoutExpired) as error:
         raise UserError(f"verify: {what} could not be run ({error}).") from None
     if done.returncode:
-        said = (done.stderr.decode(errors="replace").strip().splitlines() or ["no reason given"])[-1]
+        said = (done.stderr.decode(errors="replace").strip().splitlines() or ["no reason given"])[
+            -1
+        ]
         raise UserError(f"verify: {what} failed: {said}.")
     return done.stdout
 
