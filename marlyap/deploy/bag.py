@@ -34,7 +34,7 @@ def write(
     types = needs("rosbags.typesys", "bag", "rosbags")
     if out.exists():
         raise UserError(f"out: {out} already exists; choose another file.")
-    lines = recorded(run, run.game if game is None else game, number, seed)
+    lines = recorded(run, (run.game if game is None else game).nominal, number, seed)
     kinds = types.get_typestore(types.Stores.ROS2_JAZZY)
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder, "bag")

@@ -45,7 +45,7 @@ def write(
         raise UserError(f"out: {out} already exists; choose another folder.")
     if "onnx" in runtimes:
         needs("onnx", "export --with onnx")
-    there = run.game if game is None else game
+    there = (run.game if game is None else game).nominal
     controller = run.controller(there)
     arrays, nets = express.networks(express.actors(controller.policy), there.agents)
     body = described(run, there, controller, nets)

@@ -128,8 +128,8 @@ static void observe(int leads, const float (*shift)[2], const float *own, const 
     }
 }
 
-static int act(const layer *net, int leads, const float (*shift)[2], const float *own, float age,
-               const float *goal, const float *neighbours, const unsigned char *present,
+static int act(const layer *net, int leads, const float (*shift)[2], const float *own,
+               float age, const float *goal, const float *neighbours, const unsigned char *present,
                float *command)
 {
     float observation[MARLYAP_OBSERVATION];
@@ -163,11 +163,13 @@ int marlyap_%(name)s(const float *observation, float age, float *command)
     return 1;
 }
 """
-ROBOT_HEADER = """/* Arguments: own[%(state)d], the robot's own state; age of it (s); goal[2] (m), NULL where it is
-told none; neighbours[%(slots)d][%(message)d] and present[%(slots)d], what it has heard; command[%(inputs)d], the answer.
+ROBOT_HEADER = """/* Arguments: own[%(state)d], the robot's own state; age of it (s); goal[2] (m), NULL where
+it is told none; neighbours[%(slots)d][%(message)d] and present[%(slots)d], what it has heard;
+command[%(inputs)d], the answer.
 Returns 1 where the command is the fallback. contract.json has names, units and order. */
 """
-PLAIN_HEADER = """/* Arguments: observation[%(observation)d]; age of it (s); command[%(inputs)d], the answer.
+PLAIN_HEADER = """/* Arguments: observation[%(observation)d]; age of it (s);
+command[%(inputs)d], the answer.
 Returns 1 where the command is the fallback. contract.json has names, units and order. */
 """
 

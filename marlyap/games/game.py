@@ -205,6 +205,11 @@ class AbstractGame(eqx.Module):
         """Name, unit and frame of every error."""
         return ()
 
+    @property
+    def nominal(self) -> "AbstractGame":
+        """The same without what a wrapper lets go wrong: what a team is deployed in."""
+        return self
+
     def sight(self) -> Sight | None:
         """How a robot makes its own observation; None where only the game can make it."""
         return None
