@@ -75,7 +75,9 @@ class AbstractDynamics(eqx.Module):
         x = jnp.zeros(self.dx).at[jnp.array([0, 1])].set(position)
         return x.at[2].set(angle) if "psi" in self.names else x
 
-    def step(self, x: Float[Array, "dx"], u: Float[Array, "du"], dt: float | Array) -> Float[Array, "dx"]:
+    def step(
+        self, x: Float[Array, "dx"], u: Float[Array, "du"], dt: float | Array
+    ) -> Float[Array, "dx"]:
         """x after `dt` seconds of constant inputs u, in physical units."""
         return integrate(lambda x: self.field(x, u), x, dt, self.integrator, self.blocks)
 

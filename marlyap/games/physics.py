@@ -55,7 +55,9 @@ class AbstractPlant(eqx.Module):
         """The inputs, in their units, that actions in [-1, 1] ask for; beyond that they clip."""
         return jnp.clip(action, -1.0, 1.0) * jnp.asarray(self.limits)[None]
 
-    def step(self, x: PyTree, u: Inputs, scenario: PyTree, time: Scalar, dt: float | Array) -> PyTree:
+    def step(
+        self, x: PyTree, u: Inputs, scenario: PyTree, time: Scalar, dt: float | Array
+    ) -> PyTree:
         """x after `dt` seconds of constant inputs."""
         return integrate(
             lambda x: self.field(x, u, scenario, time), x, dt, self.integrator, self.blocks
@@ -75,7 +77,11 @@ def check_inputs(
 
 
 def integrate(
-    f: Field, x: Array, dt: float | Array, integrator: Integrator, blocks: tuple[tuple[int, ...], ...]
+    f: Field,
+    x: Array,
+    dt: float | Array,
+    integrator: Integrator,
+    blocks: tuple[tuple[int, ...], ...],
 ) -> Array:
     """x [..., dx] after `dt` seconds of x' = f(x)."""
     return semi_implicit_euler(f, x, dt, blocks) if integrator == "euler" else rk4(f, x, dt)
