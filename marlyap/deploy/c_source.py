@@ -164,7 +164,8 @@ int marlyap_%(name)s(const float *observation, float age, float *command)
 }
 """
 ROBOT_HEADER = """/* Arguments: own[%(state)d], the robot's own state; age of it (s);
-goal[2] (m), NULL where it is told none; neighbours[%(slots)d][%(message)d] and present[%(slots)d], what it has heard;
+goal[2] (m), NULL where it is told none;
+neighbours[%(slots)d][%(message)d] and present[%(slots)d], what it has heard;
 command[%(inputs)d], the answer.
 Returns 1 where the command is the fallback. contract.json has names, units and order. */
 """
