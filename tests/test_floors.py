@@ -36,6 +36,7 @@ FLOORS = """
     runs
     sweeps
     report
+    deploy
     cli
     __main__
 """.split()
