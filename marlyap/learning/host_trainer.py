@@ -20,6 +20,7 @@ from marlyap.learning.hosted import Hosted
 from marlyap.learning.off_policy import Learner
 from marlyap.learning.schedule import Schedule
 from marlyap.learning.steps import Steps, Stored
+from marlyap.learning.traced import with_arrays
 from marlyap.learning.training import AbstractTrainer, Carry, Told
 from marlyap.simulation.rollout import AbstractExplorer, Uniform
 from marlyap.types import Key
@@ -136,7 +137,7 @@ class HostTrainer(AbstractTrainer):
 
     def _compiled(self, given: "Given") -> Callable[["Given"], tuple[Learner, dict[str, Any]]]:
         game = dataclasses.replace(self.game, workers=0)  # not to compile for each number of them
-        maker = dataclasses.replace(self, game=game)
+        maker = with_arrays(dataclasses.replace(self, game=game))
         return export_cache.compiled(_learn, maker, given, lambda: given[0], donate=True)
 
     def _warm(self, carry: Carry, table: "Table") -> Carry:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from marlyap.types import Key, Transition
+from marlyap.types import Key, Scalar, Transition
 
 
 class Episode(eqx.Module):
@@ -80,7 +80,7 @@ class Replay(AbstractMemory):
         size = jnp.minimum(self.size + count, self.rows)
         return Replay(episodes, (self.head + count) % self.rows, size)
 
-    def sample(self, key: Key, batch: int, gamma: float, n: int = 1) -> Transition:
+    def sample(self, key: Key, batch: int, gamma: Scalar | float, n: int = 1) -> Transition:
         """B ~ D: `batch` transitions with n-step rewards, each step equally likely."""
         k_where, k_noise = jax.random.split(key)
         most = jnp.stack([self.size, jnp.asarray(self.time)]).astype(jnp.uint32)[:, None]
@@ -99,7 +99,7 @@ class Replay(AbstractMemory):
         row: Int[Array, ""],
         t: Int[Array, ""],
         noise: Float[Array, "agent 2 du"],
-        gamma: float,
+        gamma: Scalar | float,
         n: int = 1,
     ) -> Transition:
         """The step t of one episode; fewer than n steps are summed where the episode is cut.

@@ -16,6 +16,7 @@ from marlyap.learning.diagnose import diagnose
 from marlyap.learning.health import Health
 from marlyap.learning.schedule import SCHEDULES, Schedule
 from marlyap.learning.source import Play, Simulated, shape
+from marlyap.learning.traced import with_arrays
 from marlyap.learning.training import AbstractTrainer, Carry as Carry, Told
 from marlyap.seeds import stream
 from marlyap.simulation.evaluation import outcomes
@@ -92,7 +93,8 @@ class Trainer(AbstractTrainer):
     def advance(self, carry, stop=lambda: False):
         done, mesh = int(np.min(carry.iteration)), devices.mesh_for(carry.iteration.size)
         carry = devices.placed(carry, carry.iteration.ndim > 0, mesh)
-        compiled = lambda f: export_cache.compiled(f, self, carry, lambda: carry, donate=True)
+        given = with_arrays(self)
+        compiled = lambda f: export_cache.compiled(f, given, carry, lambda: carry, donate=True)
         iterate = select = None
         while done < self.iterations and not stop():
             done += 1
@@ -114,26 +116,27 @@ class Trainer(AbstractTrainer):
 
 
 def _each(
-    f: Callable[[Carry], tuple[Carry, dict[str, Any]]], carry: Carry
+    f: Callable[[Trainer, Carry], tuple[Carry, dict[str, Any]]], trainer: Trainer, carry: Carry
 ) -> tuple[Carry, dict[str, Any]]:
     """`f` for every run: vmapped only when there are several, since a batch of one costs speed."""
     several = carry.iteration.ndim > 0
-    axis: dict[str, Any] = {"spmd_axis_name": devices.RUNS}
-    each = eqx.filter_vmap(f, **axis) if several else f
-    after, info = each(carry)
+    own = lambda x: 0 if eqx.is_array(x) and x.ndim else None  # a run's own, or that of all
+    axes: dict[str, Any] = {"in_axes": (own, eqx.if_array(0)), "spmd_axis_name": devices.RUNS}
+    each = eqx.filter_vmap(f, **axes) if several else f
+    after, info = each(trainer, carry)
     return devices.kept(after, several), info
 
 
 def _iterate(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
-    def told(carry):
+    def told(trainer, carry):
         after, info = trainer.iterate(carry)
         return after, {"log": info.log, "health": info.health._asdict()}
 
-    return _each(told, carry)
+    return _each(told, trainer, carry)
 
 
 def _select_best(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
-    return _each(trainer.select_best, carry)
+    return _each(lambda trainer, carry: trainer.select_best(carry), trainer, carry)
 
 
 def schedule_for(algorithm: AbstractAlgorithm, preset: str = "tuned") -> Schedule:

@@ -15,6 +15,7 @@ from marlyap.games.game import AbstractGame
 from marlyap.learning.algorithm import AbstractAlgorithm, Info, Watch, unwatched
 from marlyap.learning.health import Health
 from marlyap.learning.schedule import Schedule
+from marlyap.learning.traced import with_arrays
 from marlyap.nets.nets import Shape
 from marlyap.simulation.rollout import Policy
 from marlyap.types import Key, Scalar
@@ -83,8 +84,9 @@ class AbstractTrainer(eqx.Module):
     ) -> Iterator[tuple[int, Carry, Told]]:
         """Iterate to the end or until `stop()`; yields (iterations done, carry, what it tells).
 
-        The arrays of `carry` have a leading axis of runs where there are several; those of `Told`
-        always have it. The carry that goes in is used up.
+        The arrays of `carry` have a leading axis of runs where there are several, and so may those
+        of the trainer (`stacked`); those of `Told` always have it. The carry that goes in is used
+        up.
         """
 
     def iterate(self, carry: Carry, watch: Watch = unwatched) -> tuple[Carry, Info]:
@@ -137,3 +139,17 @@ def row(carry: Carry, i: int) -> Carry:
     if carry.iteration.ndim == 0:
         return carry
     return jax.tree.map(lambda x: x[i] if eqx.is_array(x) else x, carry)
+
+
+def stacked(trainers: "list[AbstractTrainer]") -> "AbstractTrainer":
+    """One trainer for several runs: the numbers that differ between them have a leading axis.
+
+    Raises UserError if they differ in more than the numbers that a program is given.
+    """
+    given = [with_arrays(trainer) for trainer in trainers]
+    free = [eqx.filter(trainer, eqx.is_array, inverse=True) for trainer in given]
+    if any(other != free[0] for other in free):
+        raise UserError("runs: they differ in more than numbers; train them in processes.")
+    if all(trainer == trainers[0] for trainer in trainers):
+        return given[0]
+    return jax.tree.map(lambda *xs: jnp.stack(xs) if eqx.is_array(xs[0]) else xs[0], *given)

@@ -1,8 +1,8 @@
 """The host loop over compiled iterations: progress, log, checkpoints, stopping."""
 
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -20,11 +20,12 @@ from marlyap.learning.algorithms import ALGORITHMS
 from marlyap.learning.health import Health, TaskFault
 from marlyap.learning.schedule import Schedule
 from marlyap.learning.trainer import Trainer, schedule_for
-from marlyap.learning.training import AbstractTrainer, Carry, row, stack
+from marlyap.learning.training import AbstractTrainer, Carry, row, stack, stacked
 from marlyap.nets.nets import LyapunovNet, NormNet
 from marlyap.runs import config, events
 from marlyap.runs.progress import show
 from marlyap.runs.run import Run, begin, sound
+from marlyap.runs.sinks import Sinks
 from marlyap.simulation.rollout import Decentralised, Policy
 from marlyap.storage import store
 from marlyap.tasks import TASKS
@@ -39,24 +40,31 @@ class Diverged(UserError):
 
 
 def fit(
-    runs: list[Run], stop: Callable[[], bool] = lambda: False, attempts: int = 1
+    runs: list[Run],
+    stop: Callable[[], bool] = lambda: False,
+    attempts: int = 1,
+    log: Sequence[str] = (),
 ) -> Iterator[events.Event]:
     """Train `runs` to the end, or until `stop()`; yields a Progress for each run and iteration.
 
-    Several runs must differ in their seed alone; they advance together under `vmap`. Everything
+    Several runs must differ in their seeds, and in numbers that their programs are given
+    (`learning.traced`), alone; they advance together under `vmap`. Everything
     is saved at the end and when stopped, so that calling this again resumes bit for bit. A run in
     which a number stops being finite is stopped, the others continue; with more `attempts` it is
-    taken up again, from its last checkpoint and with other random numbers.
+    taken up again, from its last checkpoint and with other random numbers. `log` names trackers
+    that are told the log as well.
     Raises Diverged (a UserError) if this was so in every run to the last.
     """
     with ExitStack() as held:
         for run in runs:
             held.enter_context(store.lock(run.directory))
             store.sweep(run.directory)
-        yield from _fit(runs, stop, attempts)
+        yield from _fit(runs, stop, attempts, log)
 
 
-def _fit(runs: list[Run], stop: Callable[[], bool], attempts: int) -> Iterator[events.Event]:
+def _fit(
+    runs: list[Run], stop: Callable[[], bool], attempts: int, log: Sequence[str]
+) -> Iterator[events.Event]:
     """Train the runs that stand at the same iteration together, one such group after the other.
 
     A damaged checkpoint or a fault may have thrown one run further back than the others.
@@ -69,7 +77,10 @@ def _fit(runs: list[Run], stop: Callable[[], bool], attempts: int) -> Iterator[e
             yield from (events.Warned(*one.run.named, w) for w in one.warnings)
         faults = {}
         for _, group in groupby(sorted(loaded, key=_iteration), key=_iteration):
-            faults |= yield from _together([one.reseeded(attempt) for one in group], stop)
+            going = [one.reseeded(attempt) for one in group]
+            with ExitStack() as told:
+                sinks = [told.enter_context(closing(one.run.sinks(log))) for one in going]
+                faults |= yield from _together(going, sinks, stop)
         if not faults or stop():
             break
         if attempt + 1 < attempts:
@@ -104,30 +115,31 @@ def _iteration(loaded: _Loaded) -> int:
 
 
 def _together(
-    loaded: list[_Loaded], stop: Callable[[], bool]
+    loaded: list[_Loaded], sinks: list[Sinks], stop: Callable[[], bool]
 ) -> Generator[events.Event, None, dict[int, Diverged]]:
     """Train runs that stand at the same iteration; returns why, for each seed that was stopped."""
     faults: dict[int, Diverged] = {}
     runs, trainer = [one.run for one in loaded], loaded[0].run.trainer
+    given = stacked([run.trainer for run in runs])
     first = carry = stack([one.carry for one in loaded])
     before, clock = max(one.seconds for one in loaded), time.monotonic()
     saved, alive = _Saved(clock), [True] * len(runs)
 
-    for done, carry, told in trainer.advance(first, stop):
+    for done, carry, told in given.advance(first, stop):
         seconds = before + time.monotonic() - clock
         for i, run in enumerate(runs):
             line = _line(trainer, run.seed, done, seconds, told.log, i)
             fault = _fault(line, told.health_of(i), trainer.agents)
             if fault and alive[i]:
                 alive[i] = False
-                where = None if fault.by_task else trainer.diagnose(run.load()[0], done)
+                where = None if fault.by_task else run.trainer.diagnose(run.load()[0], done)
                 says = f"{fault.says(where)} in {run.directory}."
                 faults[run.seed] = Diverged(says)
                 yield events.Diverged(*run.named, done, fault.name, says)
                 if not any(alive):
                     return faults
             if alive[i]:
-                run.log(line)
+                sinks[i].line(run.log(line))
                 yield events.Progress(*run.named, line, trainer.iterations)
         if saved.due():
             yield from saved.save(runs, carry, alive, seconds)
@@ -163,6 +175,7 @@ class Trained:
         with store.lock(run.directory):
             for line in self.history:
                 run.log(line)
+            run.sinks().close()
             run.save(self.carry, self.history[-1]["seconds"])
         return run
 

@@ -16,6 +16,7 @@ import jax
 
 from marlyap.errors import UserError
 from marlyap.learning.algorithm import AbstractAlgorithm
+from marlyap.learning.traced import program
 from marlyap.runs import config, events
 from marlyap.runs.fit import Diverged, fit
 from marlyap.runs.job import Job, Launch
@@ -58,19 +59,22 @@ def launch(
 
 
 def together(runs: list[Run], how: Launch, stop: Callable[[], bool]) -> Iterator[events.Event]:
-    """Runs that differ in their seed alone in one program; one such group after the other.
+    """Runs of one program together; one such group after the other.
+
+    They differ in their seeds, and in numbers that the program is given.
 
     Raises UserError at the end if a number stopped being finite in any of them.
     """
     failed: list[str] = []
     while runs:
         first, *others = runs
-        alike = [run.trainer.side_by_side and run.trainer == first.trainer for run in others]
+        what, apart = program(first.trainer), not first.trainer.side_by_side
+        alike = [program(run.trainer) == what and not apart for run in others]
         group = [first, *itertools.compress(others, alike)]
-        runs = [run for run in others if run not in group]
+        runs = [run for run, same in zip(others, alike, strict=True) if not same]
         says: dict[str, str] = {}
         try:
-            for event in fit(group, stop, how.tries):
+            for event in fit(group, stop, how.tries, how.log):
                 if isinstance(event, events.Diverged):
                     says[event.run] = event.says
                 yield event
