@@ -14,8 +14,10 @@ from marlyap.cli import (
     evaluate,
     export,
     listing,
+    plot,
     recheck,
     report,
+    sweep,
     swarm,
     train,
     verify,
@@ -56,6 +58,7 @@ class Verb(Protocol):
 VERBS: dict[str, Verb] = {
     "demo": demo,
     "train": train,
+    "sweep": sweep,
     "evaluate": evaluate,
     "bench": bench,
     "certify": certify,
@@ -68,6 +71,7 @@ VERBS: dict[str, Verb] = {
     "bag": bag,
     "report": report,
     "watch": watch,
+    "plot": plot,
     "list": listing,
 }
 
