@@ -53,8 +53,8 @@ if TYPE_CHECKING:
         Simulated as Simulated,
     )
     from marlyap.learning.trainer import Trainer as Trainer
-    from marlyap.report.paper import plot as plot
     from marlyap.report.curves import plot_runs as plot_runs, plot_sweep as plot_sweep
+    from marlyap.report.paper import plot as plot
     from marlyap.runs.fit import train as train
     from marlyap.runs.launch import Launch as Launch, launch as launch
     from marlyap.runs.run import Run as Run, load_policy as load_policy
