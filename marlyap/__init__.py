@@ -53,6 +53,7 @@ if TYPE_CHECKING:
         Simulated as Simulated,
     )
     from marlyap.learning.trainer import Trainer as Trainer
+    from marlyap.report.curves import plot_runs as plot_runs, plot_sweep as plot_sweep
     from marlyap.report.paper import plot as plot
     from marlyap.runs.fit import train as train
     from marlyap.runs.launch import Launch as Launch, launch as launch
@@ -67,6 +68,9 @@ if TYPE_CHECKING:
         Decentralised as Decentralised,
         rollout as rollout,
     )
+    from marlyap.sweeps.folder import Sweep as Sweep
+    from marlyap.sweeps.go import make_sweep as make_sweep, run_sweep as run_sweep
+    from marlyap.sweeps.plan import Plan as Plan
     from marlyap.tasks import Formation as Formation, Rendezvous as Rendezvous
     from marlyap.types import (
         Action as Action,
@@ -114,6 +118,10 @@ PUBLIC = {
     "runs.run": ("Run", "load_policy"),
     "simulation.evaluation": ("Evaluation", "compare", "evaluate"),
     "simulation.rollout": ("AbstractExplorer", "Decentralised", "rollout"),
+    "report.curves": ("plot_runs", "plot_sweep"),
+    "sweeps.folder": ("Sweep",),
+    "sweeps.go": ("make_sweep", "run_sweep"),
+    "sweeps.plan": ("Plan",),
     "tasks": ("Formation", "Rendezvous"),
     "types": (
         "Action",

@@ -34,7 +34,9 @@ FLOORS = """
     certificates
     conformance
     runs
+    sweeps
     report
+    deploy
     cli
     __main__
 """.split()
@@ -139,7 +141,7 @@ def test_an_upward_import_is_noticed(monkeypatch):
 @each_file
 def test_only_pictures_import_matplotlib(file):
     """Matplotlib and Pillow stay out of training: their modules are imported when one draws."""
-    names = ("bench", "gif", "interactive", "mp4", "page", "paper", "plot", "png")
+    names = ("bench", "curves", "gif", "interactive", "mp4", "page", "paper", "plot", "png")
     drawing = {f"marlyap.report.{name}" for name in names}
     if module(file) not in drawing:
         assert not {
