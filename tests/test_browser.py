@@ -156,7 +156,7 @@ TOLD = """() => { // the text inside the charts, where tooltips are
     const inside = element.shadowRoot;
     return inside ? [inside.textContent, ...within(inside)] : [];
   });
-  return within(document.getElementById("chart-0")).join(" ");
+  return within(document).join(" ");
 }"""
 
 
