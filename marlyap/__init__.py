@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     )
     from marlyap.learning.trainer import Trainer as Trainer
     from marlyap.report.curves import plot_runs as plot_runs, plot_sweep as plot_sweep
+    from marlyap.report.paper import plot as plot
     from marlyap.runs.fit import train as train
     from marlyap.runs.launch import Launch as Launch, launch as launch
     from marlyap.runs.run import Run as Run, load_policy as load_policy
@@ -111,6 +112,7 @@ PUBLIC = {
     "learning.schedule": ("Schedule",),
     "learning.source": ("AbstractSource", "CostWindow", "Play", "Simulated"),
     "learning.trainer": ("Trainer",),
+    "report.paper": ("plot",),
     "runs.fit": ("train",),
     "runs.launch": ("Launch", "launch"),
     "runs.run": ("Run", "load_policy"),

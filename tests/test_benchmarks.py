@@ -18,6 +18,7 @@ COLUMNS = {
     "environment": {"agents", "environments", "steps/s"},
     "memory": {"agents", "peak MB"},
     "peer": {"agents", "who", "steps and updates/s"},
+    "runtimes": {"runtime", "p50 us", "p99 us"},
     "seeds": {"way", "seeds", "seeds/hour", "to one"},
     "startup": {"what", "cpu s"},
     "sweep": {"what", "cpu s"},
@@ -37,7 +38,8 @@ def benchmarks(monkeypatch):
 
 
 SLOW = [
-    pytest.param(name, marks=pytest.mark.slow) for name in ("agents", "peer", "startup", "sweep")
+    pytest.param(name, marks=pytest.mark.slow)
+    for name in ("agents", "peer", "runtimes", "startup", "sweep")
 ]
 
 

@@ -49,7 +49,7 @@ def about(
 
 def usual(game: AbstractGame) -> tuple[str, ...]:
     """The certificates to ask for where none is named."""
-    return (*SAMPLED, "linearisation", *(("safe",) if has_rules(game) else ()))
+    return (*SAMPLED, "linearisation", "ellipsoid", *(("safe",) if has_rules(game) else ()))
 
 
 def chosen(names: Iterable[str], rollouts: int | None) -> dict[str, AbstractCertificate]:

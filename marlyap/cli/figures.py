@@ -16,7 +16,7 @@ from marlyap.certificates.safety import rules
 from marlyap.cli.common import Overrides
 from marlyap.controllers import CONTROLLERS, names_a_controller
 from marlyap.errors import UserError
-from marlyap.report.contents import progress
+from marlyap.report.measuring import progress
 from marlyap.runs import config, groups
 from marlyap.runs.run import Run, expand
 from marlyap.runs.subject import asked, subject

@@ -5,16 +5,22 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from marlyap.cli import (
+    agent,
+    bag,
     bench,
     certify,
     check_task,
     demo,
     evaluate,
+    export,
     listing,
+    plot,
     recheck,
     report,
+    swarm,
     sweep,
     train,
+    verify,
     watch,
 )
 from marlyap.cli.common import Overrides, Result
@@ -58,8 +64,14 @@ VERBS: dict[str, Verb] = {
     "certify": certify,
     "recheck": recheck,
     "check-task": check_task,
+    "export": export,
+    "verify": verify,
+    "agent": agent,
+    "swarm": swarm,
+    "bag": bag,
     "report": report,
     "watch": watch,
+    "plot": plot,
     "list": listing,
 }
 

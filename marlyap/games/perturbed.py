@@ -15,7 +15,7 @@ from marlyap.games.dynamics import AbstractDynamics
 from marlyap.games.game import AbstractGame, AbstractRegulation
 from marlyap.games.physics import AbstractPlant
 from marlyap.seeds import branch
-from marlyap.types import State
+from marlyap.types import Action, State
 
 
 class Perturbed(AbstractRegulation):
@@ -40,12 +40,16 @@ class Perturbed(AbstractRegulation):
     gone: tuple[int, ...] = ()  # agents that are missing
     cut: tuple[tuple[int, int], ...] = ()  # edges that are missing
     spread: float | Array = 1.0  # starts lie this many times as far out
+    silent: float = 0.0  # probability that in an episode a follower stops and falls silent
+    late: float = 0.0  # s up to which, drawn anew each episode, inputs act late; less than dt
+    measured: float = 0.0  # standard deviation of what is measured of the states, in their units
 
     def __check_init__(self):
         if not 0 < self.gain < 100 or not 0 < self.spread < 100:
             raise UserError("perturbation: gain and spread must lie between 0 and 100.")
         if not 0 <= self.noise < 100 or not 0 <= self.drop <= 1 or not 0 <= self.delay <= 1000:
             raise UserError("perturbation: noise, delay and drop must not be negative, drop <= 1.")
+        self._robots()
         missing = {*self.gone, *(i for edge in self.cut for i in edge)}
         if not missing <= set(range(self.inner.agents)):
             raise UserError(f"perturbation: {sorted(missing)} names an agent that is not there.")
@@ -60,6 +64,22 @@ class Perturbed(AbstractRegulation):
                 f"perturbation: an agent of {own[0]} cannot be taken away, since it replaces "
                 f"`{own[1]}`, which judges the whole team; leave out gone."
             )
+
+    def _robots(self) -> None:
+        """Raise UserError unless the last three fields are in range and about robots."""
+        if not 0 <= self.silent <= 1 or not 0 <= self.late < self.inner.dt or self.measured < 0:
+            raise UserError(
+                "perturbation: silent must lie between 0 and 1, late between 0 and dt, and "
+                "measured must not be negative."
+            )
+        plain = type(self.inner).step is AbstractGame.step and self.inner.sight() is not None
+        if (self.silent or self.late or self.measured) and not plain:
+            raise UserError(
+                f"perturbation: {type(self.inner).__name__} is no game of robots in the plane with "
+                "the step of all games; leave out silent, late and measured."
+            )
+        if self.silent and self.inner.leads.all():
+            raise UserError("perturbation: nobody but leaders is there; leave out silent.")
 
     # What the game inside says.
     agents = property(lambda self: self.inner.agents)  # pyright: ignore[reportAssignmentType]
@@ -121,6 +141,7 @@ class Perturbed(AbstractRegulation):
         idle = self.driven.hold(start)
         queue = jnp.broadcast_to(idle, (self.delay, *idle.shape))
         memory = {"seed": jax.random.key_data(seed), "queue": queue, "inner": start.memory}
+        memory |= {"last": idle} if self.late else {}
         return State(x=start.x, scenario=start.scenario, t=start.t, memory=memory)
 
     def linked(self, state):
@@ -131,19 +152,58 @@ class Perturbed(AbstractRegulation):
         return linked & ~jax.random.bernoulli(key, self.drop, linked.shape)
 
     def observe(self, state, links):
-        return self.inner.observe(self.inside(state), links)
+        inside = self.inside(state)
+        if self.measured:
+            key = jax.random.fold_in(self._key(state, 4), state.t)
+            x = inside.x + self.measured * jax.random.normal(key, inside.x.shape)
+            inside = eqx.tree_at(lambda s: s.x, inside, x)
+        return self.inner.observe(inside, links)
 
     def observation_entries(self):
         return self.inner.observation_entries()
+
+    def sight(self):
+        return self.inner.sight()
+
+    @property
+    def nominal(self):
+        return self.inner.nominal
 
     def step(self, state, action):
         queue = jnp.concatenate([state.memory["queue"], action[None]])
         now, key = queue[0], jax.random.fold_in(self._key(state, 2), state.t)
         if _on(self.noise):
             now = now + self.noise * jax.random.normal(key, now.shape)
-        after = self.driven.step(self.inside(state), now)
+        before = self.inside(state)
+        after = self._acting_late(state, now) if self.late else self.driven.step(before, now)
         memory = state.memory | {"queue": queue[1:], "inner": after.memory}
-        return State(x=after.x, scenario=after.scenario, t=after.t, memory=memory)
+        memory |= {"last": now} if self.late else {}
+        x = self._stopped(state, before.x, after.x) if self.silent else after.x
+        return State(x=x, scenario=after.scenario, t=after.t, memory=memory)
+
+    def _acting_late(self, state: State, action: Action) -> State:
+        """The step in which the last action still acts at first."""
+        before, plant = self.inside(state), self.plant
+        late = jax.random.uniform(self._key(state, 5), (), maxval=self.late)
+        time, x = before.t * self.dt, before.x
+        for asked, seconds in ((state.memory["last"], late), (action, self.dt - late)):
+            x = plant.step(x, plant.inputs_of(asked), before.scenario, time, seconds)
+        return State(x=x, scenario=before.scenario, t=before.t + 1, memory=before.memory)
+
+    def _stopped(self, state: State, before: Array, after: Array) -> Array:
+        """Whoever is silent stands where it was: what its neighbours take it for."""
+        angle = before[:, 2] if "psi" in self.dynamics.names else jnp.zeros(self.agents)
+        still = jax.vmap(self.dynamics.rest)(self.inner.positions(self.inside(state)), angle)
+        return jnp.where(self.silenced(state)[:, None], still, after)
+
+    def silenced(self, state: State) -> Bool[Array, "agent"]:
+        """Who has stopped and fallen silent by now: at most one follower, from some step on."""
+        k_whether, k_who, k_when = jax.random.split(self._key(state, 3), 3)
+        followers = jnp.asarray(np.flatnonzero(~self.inner.leads))
+        who = jax.random.choice(k_who, followers)
+        when = jax.random.randint(k_when, (), 0, self.horizon)
+        gone = jax.random.bernoulli(k_whether, self.silent) & (state.t >= when)
+        return gone & (jnp.arange(self.agents) == who)
 
     def outside(self, inside: State, state: State) -> State:
         """A state of the game inside, with what this one remembers in `state`."""
@@ -219,28 +279,32 @@ class Perturbed(AbstractRegulation):
         return self.inner.positions(self.inside(state))
 
     def distance(self, state):
-        return self._of_those_present(self.inner.distance(self.inside(state)))
+        return self._judged(state, self.inner.distance(self.inside(state)))
 
     def costs(self, state, action):
-        return self._of_those_present(self.inner.costs(self.inside(state), action))
+        return self._judged(state, self.inner.costs(self.inside(state), action))
 
     def rewards(self, state, action):
-        return self._of_those_present(self.inner.rewards(self.inside(state), action))
+        return self._judged(state, self.inner.rewards(self.inside(state), action))
 
     def errors(self, state):
         errors = self.inner.errors(self.inside(state))
-        return jnp.where(jnp.asarray(self.present)[:, None], errors, 0.0)
+        return jax.vmap(lambda e: self._judged(state, e), 1, 1)(errors)
 
     def success(self, state):
-        return super().success(state) if self.gone else self.inner.success(self.inside(state))
+        some = self.gone or self.silent
+        return super().success(state) if some else self.inner.success(self.inside(state))
 
     def violations(self, state):
         # Nobody collides with an agent that is gone.
         there = self.inner.violations(self.inner.aside(self.inside(state), ~self.present))
         return there & jnp.asarray(self.present)
 
-    def _of_those_present(self, values: Float[Array, "agent"]) -> Float[Array, "agent"]:
-        return jnp.where(jnp.asarray(self.present), values, 0.0)
+    def _judged(self, state: State, values: Float[Array, "agent"]) -> Float[Array, "agent"]:
+        """The values of those who are there and can act, 0 of the others."""
+        there = jnp.asarray(self.present)
+        there = there & ~self.silenced(state) if self.silent else there
+        return jnp.where(there, values, 0.0)
 
     def _key(self, state: State, purpose: int) -> Array:
         return jax.random.fold_in(jax.random.wrap_key_data(state.memory["seed"]), purpose)
