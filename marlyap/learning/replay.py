@@ -43,7 +43,7 @@ class AbstractMemory(eqx.Module):
         """With what was just played; the oldest is overwritten."""
 
     @abc.abstractmethod
-    def sample(self, key: Key, batch: int, gamma: float, n: int = 1) -> Transition:
+    def sample(self, key: Key, batch: int, gamma: Scalar | float, n: int = 1) -> Transition:
         """`batch` transitions with n-step rewards, each step equally likely."""
 
     @abc.abstractmethod

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from marlyap.learning.replay import AbstractMemory, regrown
-from marlyap.types import Key, Transition
+from marlyap.types import Key, Scalar, Transition
 
 
 class Stored(eqx.Module):
@@ -51,7 +51,7 @@ class Steps(AbstractMemory):
         size = jnp.minimum(self.size + count, self.rows)
         return Steps(kept, (self.head + count) % self.rows, size)
 
-    def sample(self, key: Key, batch: int, gamma: float, n: int = 1) -> Transition:
+    def sample(self, key: Key, batch: int, gamma: Scalar | float, n: int = 1) -> Transition:
         """`batch` transitions with n-step rewards, each step of each copy equally likely."""
         k_where, k_noise = jax.random.split(key)
         copies = self.kept.ended.shape[1]
@@ -70,7 +70,7 @@ class Steps(AbstractMemory):
         age: Int[Array, ""],
         copy: Int[Array, ""],
         noise: Float[Array, "agent 2 du"],
-        gamma: float,
+        gamma: Scalar | float,
         n: int = 1,
     ) -> Transition:
         """The step `age` of one copy, 0 being the oldest; fewer than n are summed at an end.

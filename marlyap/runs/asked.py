@@ -33,7 +33,8 @@ class Asked:
 
 def assemble(asked: Asked, overrides: Mapping[str, str]) -> AbstractTrainer:
     """Task, algorithm and schedule as asked for."""
-    return trainer_for(**parts(asked, overrides))
+    made = parts(asked, overrides)
+    return trainer_for(made["game"], made["algorithm"], made["schedule"])
 
 
 def parts(asked: Asked, overrides: Mapping[str, str]) -> dict[str, Any]:

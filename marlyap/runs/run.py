@@ -325,7 +325,7 @@ class Run:
 
     def sinks(self, names: Iterable[str] = ()) -> Sinks:
         """Where the log is told as well, with all that it holds: log.csv, TensorBoard, these."""
-        made = {"task": self.game, "algorithm": self.trainer.algorithm}
+        made = {"task": self.trainer.game, "algorithm": self.trainer.algorithm}
         made |= {"schedule": self.trainer.schedule}
         about = About(
             self.directory,
