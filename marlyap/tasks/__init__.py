@@ -26,7 +26,9 @@ TASKS = {
     "rendezvous-hard": Rendezvous(agents=5, graph="path", dynamics=Unicycle(limits=(2.0, 2.0))),
     "rendezvous-late": Rendezvous(dynamics=LateUnicycle()),
     "rendezvous-rest": Rendezvous(rest_weight=0.03, horizon=60),
-    "rendezvous-robust": Perturbed(Rendezvous(), drop=0.2, silent=0.5, late=0.05, measured=0.01),
+    "rendezvous-robust": Perturbed(  # pyright: ignore[reportCallIssue] -- the rest is inner's
+        inner=Rendezvous(), drop=0.2, silent=0.5, late=0.05, measured=0.01
+    ),
     "formation": Formation(),
     "formation-di": DisplacementFormation(),
     "cartpoles": CartPoles(),
