@@ -30,6 +30,7 @@ FLOORS = """
     simulation
     nets
     controllers
+    shields
     learning
     certificates
     conformance

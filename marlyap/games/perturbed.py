@@ -1,24 +1,22 @@
 """The same game, disturbed: what a controller meets that it was not made for."""
 
-import dataclasses
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from marlyap import graph as graphs
 from marlyap.errors import UserError
 from marlyap.games.dynamics import AbstractDynamics
 from marlyap.games.game import AbstractGame, AbstractRegulation
 from marlyap.games.physics import AbstractPlant
+from marlyap.games.wrapper import AbstractWrapper
 from marlyap.seeds import branch
 from marlyap.types import State
 
 
-class Perturbed(AbstractRegulation):
+class Perturbed(AbstractWrapper):
     """`inner` with stronger or weaker inputs, noise, delay, lost messages, agents or edges.
 
     A controller made for `inner` drives it unchanged. Every method of `inner` is asked, with the
@@ -40,12 +38,17 @@ class Perturbed(AbstractRegulation):
     gone: tuple[int, ...] = ()  # agents that are missing
     cut: tuple[tuple[int, int], ...] = ()  # edges that are missing
     spread: float | Array = 1.0  # starts lie this many times as far out
+    push: float | Array = 0.0  # every so often all rates of an agent jump by + or - this (SI)
+    jump: float | Array = 0.0  # every so often the target moves anywhere in [-jump, jump]^2 (m)
+    every: int = 40  # steps from one push or jump to the next
 
     def __check_init__(self):
         if not 0 < self.gain < 100 or not 0 < self.spread < 100:
             raise UserError("perturbation: gain and spread must lie between 0 and 100.")
         if not 0 <= self.noise < 100 or not 0 <= self.drop <= 1 or not 0 <= self.delay <= 1000:
             raise UserError("perturbation: noise, delay and drop must not be negative, drop <= 1.")
+        if not 0 <= self.push < 1e6 or not 0 <= self.jump < 1e6 or self.every < 1:
+            raise UserError("perturbation: push and jump must not be negative, every at least 1.")
         missing = {*self.gone, *(i for edge in self.cut for i in edge)}
         if not missing <= set(range(self.inner.agents)):
             raise UserError(f"perturbation: {sorted(missing)} names an agent that is not there.")
@@ -60,22 +63,6 @@ class Perturbed(AbstractRegulation):
                 f"perturbation: an agent of {own[0]} cannot be taken away, since it replaces "
                 f"`{own[1]}`, which judges the whole team; leave out gone."
             )
-
-    # What the game inside says.
-    agents = property(lambda self: self.inner.agents)  # pyright: ignore[reportAssignmentType]
-    graph = property(lambda self: self.inner.graph)  # pyright: ignore[reportAssignmentType]
-    dt = property(lambda self: self.inner.dt)  # pyright: ignore[reportAssignmentType]
-    horizon = property(lambda self: self.inner.horizon)  # pyright: ignore[reportAssignmentType]
-
-    @property
-    def slots(self) -> Int[np.ndarray, "agent slot"]:
-        """Those of the game inside: the shape of what agents see stays."""
-        return self.inner.slots
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or name == "inner":
-            raise AttributeError(name)
-        return getattr(self.inner, name)
 
     @property
     def driven(self) -> AbstractGame:
@@ -103,14 +90,6 @@ class Perturbed(AbstractRegulation):
             linked[a, b] = linked[b, a] = False
         return linked
 
-    def strengthened(self, gain):
-        return dataclasses.replace(self, inner=self.inner.strengthened(gain))
-
-    def inside(self, state: State) -> State:
-        """The state as the game inside knows it."""
-        memory = state.memory["inner"]
-        return State(x=state.x, scenario=state.scenario, t=state.t, memory=memory)
-
     def reset(self, key):
         start = self.inner.reset(key)
         if _on(self.spread - 1):
@@ -130,93 +109,35 @@ class Perturbed(AbstractRegulation):
         key = jax.random.fold_in(self._key(state, 1), state.t)
         return linked & ~jax.random.bernoulli(key, self.drop, linked.shape)
 
-    def observe(self, state, links):
-        return self.inner.observe(self.inside(state), links)
-
-    def observation_entries(self):
-        return self.inner.observation_entries()
+    def underway(self, state):
+        return jnp.concatenate([super().underway(state), state.memory["queue"]])
 
     def step(self, state, action):
         queue = jnp.concatenate([state.memory["queue"], action[None]])
         now, key = queue[0], jax.random.fold_in(self._key(state, 2), state.t)
         if _on(self.noise):
             now = now + self.noise * jax.random.normal(key, now.shape)
-        after = self.driven.step(self.inside(state), now)
+        after = self.driven.step(self._struck(state), now)
         memory = state.memory | {"queue": queue[1:], "inner": after.memory}
         return State(x=after.x, scenario=after.scenario, t=after.t, memory=memory)
 
-    def outside(self, inside: State, state: State) -> State:
-        """A state of the game inside, with what this one remembers in `state`."""
+    def _struck(self, state: State) -> State:
+        """The state inside, pushed or with another target where the time for it has come."""
+        inside, due = self.inside(state), (state.t > 0) & (state.t % self.every == 0)
+        for size, purpose in ((self.push, 4), (self.jump, 5)):
+            if _on(size):
+                strike = self.inner.pushed if purpose == 4 else self.inner.retargeted
+                key = jax.random.fold_in(self._key(state, purpose), state.t)
+                struck = strike(inside, size, key)
+                inside = jax.tree.map(lambda a, b: jax.lax.select(due, a, b), struck, inside)
+        return inside
+
+    def outside(self, inside, state):
         memory = state.memory | {"inner": inside.memory}
         return State(x=inside.x, scenario=inside.scenario, t=inside.t, memory=memory)
 
-    def features(self, state):
-        return self.inner.features(self.inside(state))
-
-    def terminated(self, state):
-        return self.inner.terminated(self.inside(state))
-
-    def failed(self, state):
-        return self.inner.failed(self.inside(state))
-
-    @property
-    def failure_cost(self):
-        return self.inner.failure_cost
-
-    @property
-    def edge(self):
-        return self.inner.edge
-
-    @property
-    def edge_cost(self):
-        return self.inner.edge_cost
-
-    @property
-    def unit(self):
-        return self.inner.unit
-
-    @property
-    def smooth(self):
-        return self.inner.smooth
-
-    @property
-    def tolerances(self):
-        return self.inner.tolerances
-
-    @property
-    def leads(self):
-        return self.inner.leads
-
-    @property
-    def kinds(self):
-        return self.inner.kinds
-
-    def error_entries(self):
-        return self.inner.error_entries()
-
     def hold(self, state):
         return self.driven.hold(self.inside(state))
-
-    def at_target(self, state):
-        return self.outside(self.inner.at_target(self.inside(state)), state)
-
-    def farther(self, state, factor):
-        return self.outside(self.inner.farther(self.inside(state), factor), state)
-
-    def aside(self, state, gone):
-        return self.outside(self.inner.aside(self.inside(state), gone), state)
-
-    def scene(self, state):
-        return self.inner.scene(self.inside(state))
-
-    def signals(self, state):
-        return self.inner.signals(self.inside(state))
-
-    def resized(self, agents):
-        return dataclasses.replace(self, inner=self.inner.resized(agents))
-
-    def positions(self, state):
-        return self.inner.positions(self.inside(state))
 
     def distance(self, state):
         return self._of_those_present(self.inner.distance(self.inside(state)))
@@ -232,7 +153,7 @@ class Perturbed(AbstractRegulation):
         return jnp.where(jnp.asarray(self.present)[:, None], errors, 0.0)
 
     def success(self, state):
-        return super().success(state) if self.gone else self.inner.success(self.inside(state))
+        return AbstractGame.success(self, state) if self.gone else super().success(state)
 
     def violations(self, state):
         # Nobody collides with an agent that is gone.
@@ -263,16 +184,20 @@ def judges_as_a_team(game: AbstractGame) -> tuple[str, str] | None:
 
 def traced(game: Perturbed) -> Perturbed:
     """The same with its numbers as arrays, so that jit compiles once for all of their values."""
-    numbers = lambda g: (g.gain, g.noise, g.drop, g.spread)
+    numbers = lambda g: (g.gain, g.noise, g.drop, g.spread, *struck(g))
+    # A game whose agents cannot be pushed must not be asked to: off stays off.
+    struck = lambda g: tuple(x for x in (g.push, g.jump) if _on(x))
     return eqx.tree_at(numbers, game, tuple(jnp.asarray(float(x)) for x in numbers(game)))
 
 
 def nominal_limits(game: AbstractGame) -> AbstractGame:
     """The same, perturbed in all but the strength of its inputs: what a controller is told."""
+    if not isinstance(game, AbstractWrapper):
+        return game
+    game = eqx.tree_at(lambda g: g.inner, game, nominal_limits(game.inner))
     if not isinstance(game, Perturbed):
         return game
-    parts = lambda g: (g.inner, g.gain)
-    return eqx.tree_at(parts, game, (nominal_limits(game.inner), jnp.asarray(1.0)))
+    return eqx.tree_at(lambda g: g.gain, game, jnp.asarray(1.0))
 
 
 def _on(x: float | Array) -> bool:

@@ -16,6 +16,7 @@ from marlyap.tasks.quads_planar import PlanarFormation as PlanarFormation
 from marlyap.tasks.quads_space import SpaceFormation as SpaceFormation
 from marlyap.tasks.rendezvous import Rendezvous as Rendezvous
 from marlyap.tasks.ring import Ring as Ring
+from marlyap.tasks.runaway import Runaway as Runaway
 from marlyap.tasks.voltage import PowerFlow, Voltage as Voltage
 
 
@@ -25,6 +26,7 @@ TASKS = {
     "rendezvous-hard": Rendezvous(agents=5, graph="path", dynamics=Unicycle(limits=(2.0, 2.0))),
     "rendezvous-late": Rendezvous(dynamics=LateUnicycle()),
     "rendezvous-rest": Rendezvous(rest_weight=0.03, horizon=60),
+    "runaway": Runaway(),
     "formation": Formation(),
     "formation-di": DisplacementFormation(),
     "cartpoles": CartPoles(),
