@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from marlyap.cli.common import Overrides, Result, say
 from marlyap.cli.environment import prepare
-from marlyap.cli.options import NAMED, OVERRIDES, Once, number, place
+from marlyap.cli.options import NAMED, OVERRIDES, SHIELD, Once, number, place
 from marlyap.errors import UserError
 from marlyap.runs.job import Launch
 
@@ -15,6 +15,7 @@ EPILOG = OVERRIDES
 EXAMPLES = """
   marlyap train rendezvous masac-lyapunov
   marlyap train formation masac --seeds 0 1 2 --steps 100000 --task.agents 5
+  marlyap train rendezvous masac --shield --shield.action residual
   marlyap train platoon.py:Platoon apg
   marlyap train --resume runs/rendezvous/masac-lyapunov/seed0"""
 
@@ -33,6 +34,7 @@ def options(p: ArgumentParser) -> None:
     own = "where a resumed run's is your own code"
     p.add_argument("--task", dest="own_task", help=f"the task, {own}")
     p.add_argument("--algorithm", dest="own_algorithm", help=f"the algorithm, {own}")
+    p.add_argument("--shield", action="store_true", help=SHIELD)
     p.add_argument("--parallel", default="auto", help="seeds: auto, process (one a core) or vmap")
     p.add_argument("--device", default=None, help="cpu or gpu (default: what JAX finds)")
     p.add_argument(
@@ -49,6 +51,7 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     if args.resume:
         given = {"--seeds": args.seeds, "--steps": args.steps, "--preset": args.preset}
         given |= {"--out": args.out, "--force": args.force or None}
+        given |= {"--shield": args.shield or None}
         given |= {f"--{path}": value for path, value in overrides.items()}
         for option in [k for k, v in given.items() if v is not None]:
             raise UserError(f"{option}: a resumed run keeps its settings; leave it out.")
@@ -61,7 +64,7 @@ def run(args: Namespace, overrides: Overrides) -> Result:
             raise UserError(f"{option}: it is for --resume; a new run is train TASK ALGORITHM.")
         if not args.task or not args.algorithm:
             raise UserError("train: name a task and an algorithm, as in train rendezvous masac.")
-        asked = training.Asked(args.task, args.algorithm, args.preset, args.steps)
+        asked = training.Asked(args.task, args.algorithm, args.preset, args.steps, args.shield)
         runs = training.create(asked, overrides, args.seeds or ["0"], args.out, args.force)
         how = replace(how, task=args.task, algorithm=args.algorithm)
     code = training.trained(runs, how, new=not args.resume)

@@ -19,7 +19,8 @@ from marlyap.runs.launch import launch
 from marlyap.runs.progress import show
 from marlyap.runs.run import Run, expand
 from marlyap.runs.stop import Stop
-from marlyap.runs.subject import supplies
+from marlyap.runs.subject import supplies, unfolded
+from marlyap.shields import behind
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class Asked:
     algorithm: str
     preset: str | None = None
     steps: int | None = None
+    shield: bool = False  # whether it is trained behind one
 
     @property
     def names(self) -> dict[str, str]:
@@ -103,11 +105,13 @@ def assemble(asked: Asked, overrides: Overrides) -> Trainer:
     game = config.load(asked.task, AbstractGame)
     algorithm = PRESETS[preset](config.load(asked.algorithm, AbstractAlgorithm))
     schedule = schedule_for(algorithm, preset)
-    parts = {"task": game, "algorithm": algorithm, "schedule": schedule}
+    parts = unfolded(game, asked.shield, overrides)
+    parts |= {"algorithm": algorithm, "schedule": schedule}
     parts = config.override_all(parts, overrides)
     if asked.steps is not None:
         parts["schedule"] = config.override(parts["schedule"], "steps", str(asked.steps))
-    return Trainer(parts["task"], parts["algorithm"], parts["schedule"])
+    game = behind(parts["task"], parts.get("shield"))
+    return Trainer(game, parts["algorithm"], parts["schedule"])
 
 
 def seeds(words: list[str]) -> list[int]:

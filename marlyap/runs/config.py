@@ -29,6 +29,7 @@ from marlyap.learning.algorithms import ALGORITHMS
 from marlyap.learning.constraint import AbstractConstraint
 from marlyap.learning.constraints import CONSTRAINTS
 from marlyap.learning.schedule import Schedule
+from marlyap.shields import Shield, Shielded
 from marlyap.tasks import TASKS
 
 
@@ -56,7 +57,9 @@ class NotOfThatKind(UserError):
 def known() -> dict[str, type]:
     """The classes that a record may name without anyone's leave."""
     members = [o for family in FAMILIES.values() for o in family.values()]
-    return {cls.__name__: cls for o in members for cls in classes_in(o)} | {"Schedule": Schedule}
+    return {cls.__name__: cls for o in members for cls in classes_in(o)} | {
+        cls.__name__: cls for cls in (Schedule, Shield, Shielded)
+    }
 
 
 def suggest(word: str, among: Iterable[str]) -> str:

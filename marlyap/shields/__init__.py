@@ -2,4 +2,4 @@
 
 from marlyap.shields.plan import Plan as Plan
 from marlyap.shields.shield import Shield as Shield
-from marlyap.shields.shielded import Shielded as Shielded
+from marlyap.shields.shielded import Shielded as Shielded, behind as behind, split as split

@@ -13,7 +13,6 @@ and S + A >= 0 or the window is open; then S <- clip(S + A, 0, sigma J'). Else k
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from marlyap import graph as graphs
 from marlyap.errors import UserError
-from marlyap.games.game import AbstractRegulation
+from marlyap.games.game import AbstractGame, AbstractRegulation, regulated
 from marlyap.games.wrapper import AbstractWrapper, plain_game
 from marlyap.shields.plan import Plan, Worth, foreseen, laws, worths
 from marlyap.shields.shield import Shield
@@ -181,6 +180,17 @@ class Shielded(AbstractWrapper):
         return self.inner.hold(self.inside(state))
 
 
-def behind(game: AbstractRegulation, shield: Shield | None) -> AbstractRegulation:
-    """The game behind this shield; as it is where there is none."""
-    return game if shield is None else Shielded(game, shield)
+def behind(game: AbstractGame, shield: Shield | None) -> AbstractGame:
+    """The game behind this shield; as it is where there is none.
+
+    Raises UserError for a game whose agents have no base law.
+    """
+    if shield is None:
+        return game
+    shield.plan(plain_game(game))
+    return Shielded(regulated(game), shield)
+
+
+def split(game: AbstractGame) -> tuple[AbstractGame, Shield | None]:
+    """The game before its shield, and the shield if it has one."""
+    return (game.inner, game.shield) if isinstance(game, Shielded) else (game, None)
