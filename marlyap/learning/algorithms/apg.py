@@ -3,7 +3,7 @@
     symbol             here                            meaning
     mu_phi             pi, by its mode                 deterministic decentralised policies
     l(c)               `sharp`                         c + sharpness c / (c + edge cost)
-    w_t                `weights`                       grow as t^2, and sum to 1
+    w_t                `weights`                       grow as t^`late`, and sum to 1
     J(phi)             J                               E_{s_0}[ sum_t w_t l(c_t) + l(c_H) ]
     Delta_t            `rise`                          max(0, c_{t+T} - (1 - decrease) c_t)
 
@@ -50,6 +50,7 @@ class APG(AbstractAlgorithm):
     actor_width: int = 64  # units in each of two hidden layers
     shared: bool = False  # one set of actor weights for all agents of a kind
     sharpness: float = 0.5  # extra cost of being beyond the edge of success, beside the cost
+    late: float = 2.0  # costs weigh as this power of the time; 0: all alike
     clip: float = 1.0  # largest norm of a gradient
     ema_rate: float = 1e-2  # how fast the deployed policy follows the actor; 1 is the actor itself
     weight: float = 0.0  # of the decrease condition
@@ -65,6 +66,7 @@ class APG(AbstractAlgorithm):
         check_range("T", self.T, 1, 10_000)
         for name in ("sharpness", "weight"):
             check_range(name, getattr(self, name), 0, 1e6)
+        check_range("late", self.late, 0, 10)
 
     def init(self, shape, key):
         pi = Actors(shape, self.actor_width, self.shared, key=key)
@@ -96,7 +98,7 @@ class APG(AbstractAlgorithm):
         end = charged(game, last, game.hold(last))[0]
         cost = jnp.where(ended[:, None], 0.0, jnp.concatenate([path.cost, end[None]]))
         sharp = lambda c: jnp.mean(c + self.sharpness * c / (c + game.edge_cost), axis=-1)
-        weights = jnp.arange(1, game.horizon + 1) ** 2.0
+        weights = jnp.arange(1, game.horizon + 1) ** self.late
         J = jnp.sum(weights / jnp.sum(weights) * sharp(cost[:-1])) + sharp(cost[-1])
         J = J + self.weight * self.rise(jnp.mean(cost, axis=1), game)
         return J, (path.cost, path.reward)
