@@ -8,9 +8,9 @@
 
 It leaves in `--results`
 
-    shield.csv         one row for each policy, training seed, setting, and with or without the shield
-    shield-starts.csv  the cost of each start in the undisturbed game, so that policies can be paired
-    shield-any.csv     what policies that were not trained, or that mean ill, make of a shielded team
+    shield.csv         a row for each policy, training seed, setting, with and without the shield
+    shield-starts.csv  the cost of each start in the undisturbed game, to pair policies by start
+    shield-any.csv     what policies that were never trained, or mean ill, make of a shielded team
 
 A row that is there is not made again. The policies, each trained once a seed:
 
@@ -57,7 +57,6 @@ ROBUST = {
     "cut": {"cut": ((0, 2),)},
     "noise .3": {"noise": 0.3},
     "gain 2": {"gain": 2.0},
-    "delay 1": {"delay": 1},
     "delay 1, predicted": {"delay": 1},
 }
 UNSTABLE = {
@@ -67,9 +66,9 @@ UNSTABLE = {
     "noise .3": {"noise": 0.3},
     "gain .7": {"gain": 0.7},
     "gain .7, cautious": {"gain": 0.7},
-    "gain .85, cautious": {"gain": 0.85},
     "gain 1, cautious": {},
 }
+ALONE = {"noise .3", "drop .5", "gone", "cut", "delay 1, predicted", "far2"}  # with a shield only
 SETTINGS = {"rendezvous": ROBUST, "runaway": UNSTABLE, "rendezvous-path5": {"far3": ROBUST["far3"]}}
 
 
@@ -132,7 +131,7 @@ def judged(team: Team, controller: Any, seed: Any, args: Any) -> Iterator[tuple[
         for on in (False, True):
             key = (team.task, team.name, seed, "on" if on else "off", setting)
             cautious = "cautious" in setting
-            if tuple(map(str, key)) in there or (cautious and team.shield(on, True) is None):
+            if tuple(map(str, key)) in there or (not on and (cautious or setting in ALONE)):
                 continue
             disturbed = Perturbed(TASKS[team.task], **change) if change else TASKS[team.task]  # pyright: ignore
             game = behind(disturbed, team.shield(on, cautious))

@@ -11,6 +11,7 @@ from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness
 from marlyap.certificates.safety import Apart, Safe
+from marlyap.certificates.shielded import Shielded
 from marlyap.certificates.theorem1 import Theorem1
 
 
@@ -27,5 +28,6 @@ CERTIFICATES: dict[str, AbstractCertificate] = {
     "theorem1": Theorem1(),
     "composition": Composition(),
     "linearisation": Linearisation(),
+    "shielded": Shielded(),  # for games behind a shield only
     "closed-form": ClosedForm(),  # for the point-offset law only
 }

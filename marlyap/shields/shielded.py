@@ -102,6 +102,7 @@ class Shielded(AbstractWrapper):
         J = worths(plan, self._foreseen(inside), q).cost if self.shield.on else zero
         memory = {"inner": inside.memory, "q": q, "credit": self.shield.sigma * J, "planned": J}
         memory |= {"first": J, "paid": zero, "others": zero, "admitted": zero, "asked": zero}
+        memory |= {"late": zero}
         return State(x=inside.x, scenario=inside.scenario, t=inside.t, memory=memory)
 
     def outside(self, inside, state):
@@ -162,7 +163,7 @@ class Shielded(AbstractWrapper):
         after = self.inner.step(self.inside(state), d.action)
         arrives = d.before.steps <= self.shield.steps
         delta = jnp.nan_to_num(jnp.where(arrives, d.before.cost - m["planned"], 0.0))
-        counted = {"admitted": d.admitted & d.outside, "asked": d.outside}
+        counted = {"admitted": d.admitted, "asked": d.outside, "late": ~arrives}
         memory = {k: m[k] + v for k, v in counted.items()} | {"first": m["first"]}
         memory |= {"paid": m["paid"] + d.cost, "others": m["others"] + delta}
         memory |= {"q": d.q, "credit": d.credit, "planned": d.planned, "inner": after.memory}
