@@ -73,7 +73,7 @@ class Shielded(AbstractCertificate):
         shield: Shield = game.shield
         steps = 10 * game.horizon
         found = judged(self.judge, loop, Draw(seed, "certify", self.rollouts), steps)
-        off = tested(game, stream(seed, "calibrate"))
+        off = {k: float(v) for k, v in inexact(game, stream(seed, "calibrate")).items()}
         sums = {k: np.asarray(v, float) for k, v in found.figures.items()}
         n = int(np.max(np.ceil((1 + shield.sigma) * sums["first"] / shield.tau - 1e-4)))
         broken = faults(game, off, sums)
@@ -134,7 +134,7 @@ class Shielded(AbstractCertificate):
         return Judgement(jnp.all(within) & rests & (paid <= 1 + 1e-3), paid, figures)
 
 
-def faults(game: Game, off: dict[str, Array], sums: dict[str, np.ndarray]) -> list[str]:
+def faults(game: Game, off: dict[str, float], sums: dict[str, np.ndarray]) -> list[str]:
     """The conditions that do not hold, in words."""
     said = {
         f"model: an agent moves otherwise than it plans, by {off['model']:.2g} in a step": (
@@ -156,7 +156,7 @@ def faults(game: Game, off: dict[str, Array], sums: dict[str, np.ndarray]) -> li
 
 
 @eqx.filter_jit
-def tested(game: Game, key: Key) -> dict[str, Array]:
+def inexact(game: Game, key: Key) -> dict[str, Array]:
     """The largest faults of model, terminal set and sums at random states."""
     plan: Plan = game.plan
     k_start, k_rates, k_act, k_place = jax.random.split(key, 4)

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
@@ -41,7 +42,7 @@ class Predicting(eqx.Module):
             u, time = plant.inputs_of(action), (state.t + k) * self.game.dt
             x = plant.step(x, u, state.scenario, time, self.game.dt)
 
-        def of(i: jax.Array) -> Action:
+        def of(i: Int[Array, ""]) -> Float[Array, "du"]:
             own = jnp.arange(self.game.agents) == i
             seen = jnp.where(own[:, None], x, state.x)
             return self.controller(eqx.tree_at(lambda s: s.x, state, seen), key)[i]

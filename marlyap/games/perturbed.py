@@ -184,9 +184,10 @@ def judges_as_a_team(game: AbstractGame) -> tuple[str, str] | None:
 
 def traced(game: Perturbed) -> Perturbed:
     """The same with its numbers as arrays, so that jit compiles once for all of their values."""
-    numbers = lambda g: (g.gain, g.noise, g.drop, g.spread, *struck(g))
     # A game whose agents cannot be pushed must not be asked to: off stays off.
-    struck = lambda g: tuple(x for x in (g.push, g.jump) if _on(x))
+    struck = tuple(name for name in ("push", "jump") if _on(getattr(game, name)))
+    names = ("gain", "noise", "drop", "spread", *struck)
+    numbers = lambda g: tuple(getattr(g, name) for name in names)
     return eqx.tree_at(numbers, game, tuple(jnp.asarray(float(x)) for x in numbers(game)))
 
 
