@@ -1,5 +1,6 @@
 """The credit shield: its lemmas state by state, its theorem in rollouts, and its way into runs."""
 
+import json
 from dataclasses import replace
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from marlyap.certificates import CERTIFICATES
+from marlyap.certificates.certify import certify, save
 from marlyap.certificates.loop import ClosedLoop, seen_through
 from marlyap.certificates.shielded import faults, inexact
 from marlyap.controllers import PointPursuit, TreePursuit
@@ -19,11 +21,14 @@ from marlyap.games.perturbed import Perturbed
 from marlyap.games.wrapper import plain_game
 from marlyap.learning.algorithms import MASAC
 from marlyap.learning.schedule import Schedule
+from marlyap.learning.source import shape
 from marlyap.learning.trainer import Trainer
+from marlyap.nets.nets import Actors, Greedy
+from marlyap.recheck import Rejected, recheck
 from marlyap.runs.run import Run
 from marlyap.runs.subject import asked, subject
 from marlyap.shields import Shield, Shielded, split
-from marlyap.simulation.rollout import rollout
+from marlyap.simulation.rollout import Decentralised, rollout
 from marlyap.tasks import TASKS
 from marlyap.tasks.formation import Formation
 from marlyap.tasks.formation_di import DisplacementFormation
@@ -349,3 +354,25 @@ def test_a_point_drives_to_its_place_in_a_formation():
     start = game.reset(jax.random.key(0))
     seen = eqx.filter_jit(rollout)(game, PointPursuit(game), start, jax.random.key(0), 40)
     assert float(jnp.max(game.distance(jax.tree.map(lambda x: x[-1], seen.state)))) < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("graph", ["complete", "path"])
+def test_recheck_derives_the_certificate_without_jax(tmp_path, graph, full_compilation):
+    """And rejects one in which the shield had admitted more, or the bound were lower."""
+    game = Shielded(Rendezvous(graph=graph), Shield(action="residual"))
+    pi = Actors(shape(game), 16, False, key=jax.random.key(1))
+    controller = Decentralised(Greedy(pi), game)
+    chosen = {"shielded": replace(CERTIFICATES["shielded"], rollouts=20)}
+    result = certify(game, controller, chosen, 0, 0.99)
+    assert result["holds"]
+    save(tmp_path / "good", result, game, controller)
+    found = recheck(tmp_path / "good")
+    assert found["agrees"] and found["rechecked"]["shielded"]["successes"] == 20
+    for part, value in (("bound", 50.0), ("claim", "it never moves"), ("holds", False)):
+        told = json.loads(json.dumps(result))
+        told["verdicts"]["shielded"][part] = value
+        told["holds"] = told["verdicts"]["shielded"]["holds"]
+        save(tmp_path / part, told, game, controller)
+        with pytest.raises(Rejected):
+            recheck(tmp_path / part)
