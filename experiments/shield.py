@@ -37,6 +37,7 @@ from marlyap.games.perturbed import Perturbed
 from marlyap.learning.algorithms import APG, MASAC
 from marlyap.learning.constraints import Lyapunov
 from marlyap.learning.schedule import Schedule
+from marlyap.learning.trainer import schedule_for
 from marlyap.runs.provenance import provenance
 from marlyap.shields import Shield, Shielded, behind
 from marlyap.simulation.evaluation import Evaluation, evaluate, share
@@ -48,7 +49,7 @@ RESIDUAL = APG(late=0.0, sharpness=0.0)
 CONTROL = MASAC(constraint=Lyapunov(reading="critic", weight=1.0))
 BY_HAND = {"rendezvous": "tree-pursuit", "rendezvous-path5": "tree-pursuit"}
 BY_HAND |= {"runaway": "point-pursuit"}
-PLANNED = {"runaway": {"steps": 80}}  # fields of the shield, where they are not the usual ones
+STEPS = {"runaway": 80}  # T, where it is not the usual one
 KEY = ["task", "policy", "seed", "shield", "setting"]
 ROBUST = {
     "far3": {"spread": 3.0},
@@ -91,7 +92,7 @@ class Team:
         if self.trained is None and not on:
             return None
         made = Shield(action=self.trained.action if self.trained else "proposal", on=on)
-        made = replace(made, **PLANNED.get(self.task, {}))
+        made = replace(made, steps=STEPS.get(self.task, 60))
         return replace(made, caution=0.7) if cautious else made
 
 
@@ -100,7 +101,7 @@ def teams() -> list[Team]:
     usual, off = Schedule(), Shield(action="residual", on=False)
     quick = Schedule(steps=3_072_000, environments=64, select_every=100)
     half = replace(usual, steps=102_400)
-    behind_it = lambda task: Shield(action="residual", **PLANNED.get(task, {}))
+    behind_it = lambda task: Shield(action="residual", steps=STEPS.get(task, 60))
     found = []
     for task in ("rendezvous", "runaway"):
         found += [
@@ -109,7 +110,7 @@ def teams() -> list[Team]:
             Team(task, "control", CONTROL, usual),
             Team(task, "masac", MASAC(), usual),
         ]
-    path = APG.default_schedule
+    path = schedule_for(APG())
     return [*found, Team("rendezvous-path5", "apg", APG(), path)]
 
 
@@ -133,7 +134,7 @@ def judged(team: Team, controller: Any, seed: Any, args: Any) -> Iterator[tuple[
             cautious = "cautious" in setting
             if tuple(map(str, key)) in there or (not on and (cautious or setting in ALONE)):
                 continue
-            disturbed = Perturbed(TASKS[team.task], **change) if change else TASKS[team.task]  # pyright: ignore
+            disturbed = Perturbed(inner=TASKS[team.task], **change) if change else TASKS[team.task]  # pyright: ignore
             game = behind(disturbed, team.shield(on, cautious))
             act = controller(game)
             if "predicted" in setting:
@@ -288,7 +289,7 @@ def measure(args: Any) -> None:
 
 
 if __name__ == "__main__":
-    args = options(__doc__)
+    args = options(__doc__ or "")
     args.results.mkdir(parents=True, exist_ok=True)
     if not args.draw:
         measure(args)

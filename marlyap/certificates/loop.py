@@ -50,7 +50,8 @@ class ClosedLoop(eqx.Module):
 
         Raises UserError for a perturbation that cannot be applied to this game.
         """
-        game = self.game.beneath(lambda game: traced(Perturbed(inner=regulated(game), **change)))
+        struck = lambda game: traced(Perturbed(inner=regulated(game), **change))
+        game = regulated(self.game.beneath(struck))
         eqx.filter_eval_shape(game.reset, jax.random.key(0))  # a game may refuse to move its starts
         return ClosedLoop(game, self.controller, self.V)
 

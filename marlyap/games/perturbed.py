@@ -64,6 +64,12 @@ class Perturbed(AbstractWrapper):
                 f"`{own[1]}`, which judges the whole team; leave out gone."
             )
 
+    # What the game inside says.
+    agents = property(lambda self: self.inner.agents)  # pyright: ignore[reportAssignmentType]
+    graph = property(lambda self: self.inner.graph)  # pyright: ignore[reportAssignmentType]
+    dt = property(lambda self: self.inner.dt)  # pyright: ignore[reportAssignmentType]
+    horizon = property(lambda self: self.inner.horizon)  # pyright: ignore[reportAssignmentType]
+
     @property
     def driven(self) -> AbstractGame:
         """The game inside, with inputs as strong as they are here."""

@@ -24,12 +24,6 @@ class AbstractWrapper(AbstractRegulation):
 
     inner: eqx.AbstractVar[AbstractRegulation]
 
-    # What the game inside says.
-    agents = property(lambda self: self.inner.agents)  # pyright: ignore[reportAssignmentType]
-    graph = property(lambda self: self.inner.graph)  # pyright: ignore[reportAssignmentType]
-    dt = property(lambda self: self.inner.dt)  # pyright: ignore[reportAssignmentType]
-    horizon = property(lambda self: self.inner.horizon)  # pyright: ignore[reportAssignmentType]
-
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name == "inner":
             raise AttributeError(name)

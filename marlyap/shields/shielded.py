@@ -23,7 +23,7 @@ from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame, AbstractRegulation, regulated
 from marlyap.games.wrapper import AbstractWrapper, plain_game
 from marlyap.shields.plan import Plan, Worth, foreseen, laws, worths
-from marlyap.shields.shield import Shield
+from marlyap.shields.shield import Shield, planar
 from marlyap.types import Action, State
 
 
@@ -59,15 +59,24 @@ class Shielded(AbstractWrapper):
     """
 
     inner: AbstractRegulation
-    shield: Shield = Shield()
+    shield: Shield
+
+    def __init__(self, inner: AbstractRegulation, shield: Shield = Shield()):  # noqa: B008
+        self.inner, self.shield = inner, shield
+
+    # What the game inside says.
+    agents = property(lambda self: self.inner.agents)  # pyright: ignore[reportAssignmentType]
+    graph = property(lambda self: self.inner.graph)  # pyright: ignore[reportAssignmentType]
+    dt = property(lambda self: self.inner.dt)  # pyright: ignore[reportAssignmentType]
+    horizon = property(lambda self: self.inner.horizon)  # pyright: ignore[reportAssignmentType]
 
     def __check_init__(self):
         if graphs.disk_radius(self.inner.graph) is not None:
             raise UserError("shield: it needs a tree of parents that stays; a disk changes.")
-        game = plain_game(self.inner)
+        game = planar(plain_game(self.inner))
         self.shield.plan(game)
-        if not self.inner.leads.all():
-            game.displacements  # noqa: B018  # raises where followers cannot tell their places
+        if not self.inner.leads.all():  # raises where followers cannot tell their places
+            _ = game.displacements
 
     @property
     def plan(self) -> Plan:
@@ -87,10 +96,10 @@ class Shielded(AbstractWrapper):
         return np.where(self.leads, -1, parent)
 
     def beneath(self, change):
-        return Shielded(self.inner.beneath(change), self.shield)  # pyright: ignore
+        return Shielded(regulated(self.inner.beneath(change)), self.shield)
 
     def strengthened(self, gain):
-        return Shielded(self.inner.strengthened(gain), self.shield)
+        return Shielded(regulated(self.inner.strengthened(gain)), self.shield)
 
     def reset(self, key):
         return self.begun(self.inner.reset(key))
@@ -115,10 +124,10 @@ class Shielded(AbstractWrapper):
         heard = jnp.asarray(parent >= 0) & self.inner.linked(inside)[i, parent]
         q = held
         if (parent >= 0).any():
-            places = jnp.asarray(plain_game(self.inner).displacements, held.dtype)
+            places = jnp.asarray(planar(plain_game(self.inner)).displacements, held.dtype)
             ends = jax.vmap(lambda x: plan.drive.stop(plan.game, x))(inside.x)
             q = jnp.where(heard[:, None], ends[parent] + places - places[parent], held)
-        goals = plain_game(self.inner).goals(inside)  # pyright: ignore
+        goals = planar(plain_game(self.inner)).goals(inside)
         return jnp.where(jnp.asarray(self.leads)[:, None], goals, q)
 
     def _foreseen(self, inside: State) -> Float[Array, "agent dx"]:
