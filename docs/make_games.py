@@ -5,6 +5,7 @@
 """
 
 import csv
+import dataclasses
 import inspect
 import shutil
 import sys
@@ -31,7 +32,7 @@ def pages() -> dict[str, str]:
 
 def grouped() -> dict[str, list[str]]:
     """The names of the tasks by the file that they are in."""
-    by_module = lambda name: type(TASKS[name]).__module__.rpartition(".")[2]
+    by_module = lambda name: type(TASKS[name].nominal).__module__.rpartition(".")[2]
     return {m: list(those) for m, those in groupby(sorted(TASKS, key=by_module), by_module)}
 
 
@@ -90,6 +91,8 @@ def presets(names: list[str]) -> str:
     for name in names:
         game = TASKS[name]
         base = fields(type(first)()) if _plain(type(first)) else fields(first)
+        if type(game) is not type(first):  # a game with another one inside
+            base = {f.name: f.default for f in dataclasses.fields(game)} | {"inner": game.nominal}
         other = [f"`{k} = {show(v)}`" for k, v in fields(game).items() if v != base[k]]
         lines.append(f"* `{name}`: {', '.join(other) or 'the defaults'}")
     return "\n".join(lines)

@@ -33,6 +33,8 @@ SECTIONS = {
     "types": "States, actions, observations",
     "learning": "Learning",
     "runs": "Training and runs on disk",
+    "sweeps": "Many runs",
+    "report": "Figures",
     "simulation": "Playing and measuring",
     "controllers": "Controllers",
     "certificates": "Certificates",

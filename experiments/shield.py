@@ -45,7 +45,7 @@ from marlyap.simulation.rollout import Decentralised, rollout
 from marlyap.tasks import TASKS
 
 
-RESIDUAL = APG(late=0.0, sharpness=0.0)
+RESIDUAL = APG(growth=0.0, sharpness=0.0)
 CONTROL = MASAC(constraint=Lyapunov(reading="critic", weight=1.0))
 BY_HAND = {"rendezvous": "tree-pursuit", "rendezvous-path5": "tree-pursuit"}
 BY_HAND |= {"runaway": "point-pursuit"}

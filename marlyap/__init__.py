@@ -55,6 +55,8 @@ if TYPE_CHECKING:
         Simulated as Simulated,
     )
     from marlyap.learning.trainer import Trainer as Trainer
+    from marlyap.report.curves import plot_runs as plot_runs, plot_sweep as plot_sweep
+    from marlyap.report.paper import plot as plot
     from marlyap.runs.fit import train as train
     from marlyap.runs.launch import Launch as Launch, launch as launch
     from marlyap.runs.run import Run as Run, load_policy as load_policy
@@ -69,6 +71,9 @@ if TYPE_CHECKING:
         Decentralised as Decentralised,
         rollout as rollout,
     )
+    from marlyap.sweeps.folder import Sweep as Sweep
+    from marlyap.sweeps.go import make_sweep as make_sweep, run_sweep as run_sweep
+    from marlyap.sweeps.plan import Plan as Plan
     from marlyap.tasks import Formation as Formation, Rendezvous as Rendezvous
     from marlyap.types import (
         Action as Action,
@@ -112,12 +117,17 @@ PUBLIC = {
     "learning.schedule": ("Schedule",),
     "learning.source": ("AbstractSource", "CostWindow", "Play", "Simulated"),
     "learning.trainer": ("Trainer",),
+    "report.paper": ("plot",),
     "runs.fit": ("train",),
     "runs.launch": ("Launch", "launch"),
     "runs.run": ("Run", "load_policy"),
     "shields": ("Shield", "Shielded"),
     "simulation.evaluation": ("Evaluation", "compare", "evaluate"),
     "simulation.rollout": ("AbstractExplorer", "Decentralised", "rollout"),
+    "report.curves": ("plot_runs", "plot_sweep"),
+    "sweeps.folder": ("Sweep",),
+    "sweeps.go": ("make_sweep", "run_sweep"),
+    "sweeps.plan": ("Plan",),
     "tasks": ("Formation", "Rendezvous"),
     "types": (
         "Action",

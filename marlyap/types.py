@@ -34,6 +34,15 @@ class Entry(NamedTuple):
     frame: str = ""  # own: the agent's own axes; world; empty where no axis is meant
 
 
+class Channel(NamedTuple):
+    """Neighbouring entries of an observation that belong together, such as the two of a place."""
+
+    name: str
+    size: int
+    unit: str
+    frame: str
+
+
 class State(eqx.Module):
     """Everything a game knows at one instant; an episode can be replayed from its first state.
 

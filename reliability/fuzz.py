@@ -136,13 +136,13 @@ def loaders(place: Path) -> list[Any]:
 
     def sealed(data: Any) -> None:
         (place / "two" / store.PAYLOAD).write_bytes(payload)
-        (place / "two" / store.MANIFEST).write_bytes(store._sealed(edited(data, manifest)))
+        (place / "two" / store.MANIFEST).write_bytes(store.sealed(edited(data, manifest)))
         recheck(place / "two")
 
     def verdicts(data: Any) -> None:
         meta = manifest | {"meta": edited(data, manifest["meta"])}
         (place / "two" / store.PAYLOAD).write_bytes(payload)
-        (place / "two" / store.MANIFEST).write_bytes(store._sealed(meta))
+        (place / "two" / store.MANIFEST).write_bytes(store.sealed(meta))
         recheck(place / "two")
 
     def config(data: Any) -> None:

@@ -250,3 +250,41 @@ def learner(masac, shape, batch):
             L,
         ),
     )
+
+
+def untrained(directory, game, algorithm=None, names=None):
+    """A run of this game whose policy is random: as good as a trained one where bits count."""
+    from marlyap.learning.algorithms.masac import MASAC
+    from marlyap.learning.schedule import Schedule
+    from marlyap.learning.source import shape as shape_of
+    from marlyap.learning.trainer import Trainer
+    from marlyap.runs.run import Run, flatten
+    from marlyap.storage import store
+
+    rule = MASAC(actor_width=16, critic_width=8, batch=16) if algorithm is None else algorithm
+    run = Run.create(directory, Trainer(game, rule, Schedule()), 0, names or {"task": "test"})
+    networks = filled(rule.init, shape_of(game), jax.random.key(0))
+    deployed = rule.policy(networks), rule.lyapunov(networks)
+    store.write(run.directory / "policy", "policy", flatten(deployed), {})
+    return run
+
+
+@pytest.fixture(scope="session")
+def small_run(tmp_path_factory):
+    """Three robots whose horizon is ten steps, with a random policy."""
+    from marlyap.tasks.rendezvous import Rendezvous
+
+    return untrained(tmp_path_factory.mktemp("small") / "seed0", Rendezvous(horizon=10))
+
+
+@pytest.fixture(scope="session")
+def small_bundle(small_run, tmp_path_factory):
+    """The bundle of that run, with the runtimes that can be written here."""
+    from importlib.util import find_spec
+
+    from marlyap.deploy.bundle import write
+
+    runtimes = [name for name in ("numpy", "onnx", "c") if name != "onnx" or find_spec("onnx")]
+    out = tmp_path_factory.mktemp("small") / "bundle"
+    write(small_run, out, runtimes, starts=0)
+    return out

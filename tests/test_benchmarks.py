@@ -18,6 +18,7 @@ COLUMNS = {
     "environment": {"agents", "environments", "steps/s"},
     "memory": {"agents", "peak MB"},
     "peer": {"agents", "who", "steps and updates/s"},
+    "runtimes": {"runtime", "p50 us", "p99 us"},
     "seeds": {"way", "seeds", "seeds/hour", "to one"},
     "startup": {"what", "cpu s"},
     "update": {"updates/s", "needed MFLOP", "done MFLOP", "of floor", "to plain"},
@@ -35,7 +36,9 @@ def benchmarks(monkeypatch):
     return lambda name: runpy.run_path(str(FOLDER / f"{name}.py"))
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("agents", "peer", "startup")]
+SLOW = [
+    pytest.param(name, marks=pytest.mark.slow) for name in ("agents", "peer", "runtimes", "startup")
+]
 
 
 @pytest.mark.parametrize("name", ["checkpoint", "environment", "update", *SLOW])

@@ -1,6 +1,7 @@
 """The examples run as they are, on fewer steps, and are as short as they should be."""
 
 import importlib.util
+import json
 from pathlib import Path
 
 import pytest
@@ -63,3 +64,19 @@ def test_evaluate_and_draw(run, tmp_path):
 def test_resume(run):
     assert run.finished and run.steps_done == 640
     assert [line["iteration"] for line in run.history()] == [1, 2, 3, 4]
+
+
+@pytest.mark.slow
+def test_the_notebook(tmp_path, monkeypatch):
+    """Its cells in their order, as Jupyter runs them, on fewer steps."""
+    monkeypatch.chdir(tmp_path)
+    book = json.loads((Path(__file__).parents[1] / "examples/06_sweep.ipynb").read_text())
+    code = ["".join(cell["source"]) for cell in book["cells"] if cell["cell_type"] == "code"]
+    assert not any(cell.get("outputs") for cell in book["cells"])
+    few = '"schedule.steps": 640, "schedule.environments": 4, "schedule.warmup": 160'
+    names: dict = {"__name__": "notebook"}
+    for k, source in enumerate(code):
+        source = source.replace('"schedule.steps": STEPS', few)
+        exec(compile(source, f"notebook[{k}]", "exec"), names)
+    assert {status.state for status in names["statuses"]} == {"finished"}
+    assert (tmp_path / "rates.png").stat().st_size > 1000

@@ -35,7 +35,9 @@ FLOORS = """
     certificates
     conformance
     runs
+    sweeps
     report
+    deploy
     cli
     __main__
 """.split()
@@ -140,9 +142,12 @@ def test_an_upward_import_is_noticed(monkeypatch):
 @each_file
 def test_only_pictures_import_matplotlib(file):
     """Matplotlib and Pillow stay out of training: their modules are imported when one draws."""
-    drawing = {f"marlyap.report.{name}" for name in ("bench", "gif", "page", "plot", "png")}
+    names = ("bench", "curves", "gif", "interactive", "mp4", "page", "paper", "plot", "png")
+    drawing = {f"marlyap.report.{name}" for name in names}
     if module(file) not in drawing:
-        assert not {name for name in imported(file) if name.split(".")[0] in ("matplotlib", "PIL")}
+        assert not {
+            name for name in imported(file) if name.split(".")[0] in ("matplotlib", "PIL", "bokeh")
+        }
         first = [node for node in TREES[file].body if isinstance(node, ast.Import | ast.ImportFrom)]
         assert not imported(file, ast.Module(first, [])) & drawing, "import it where one draws"
     text = file.read_text()

@@ -208,7 +208,7 @@ def test_what_is_wrong_with_an_option(argv, part, capsys):
 @pytest.mark.parametrize("flip", [False, True])
 def test_the_order_of_overrides_does_not_matter(flip):
     from marlyap.cli.parser import parse
-    from marlyap.cli.training import Asked, assemble
+    from marlyap.runs.asked import Asked, assemble
 
     words = ["--task.leaders", "4"], ["--task.agents", "5"]
     more = ["--algorithm.constraint.reading", "hinge"], ["--algorithm.constraint", "lyapunov"]

@@ -80,7 +80,7 @@ def forge(directory: Path, change=lambda manifest: None, payload: bytes | None =
         manifest["files"] = {PAYLOAD: facts}
     change(manifest)
     manifest.pop("sha256", None)
-    (directory / MANIFEST).write_bytes(store._sealed(manifest))
+    (directory / MANIFEST).write_bytes(store.sealed(manifest))
 
 
 def python(script: str, *arguments: object, **options) -> subprocess.CompletedProcess:
@@ -521,7 +521,7 @@ def test_any_value_anywhere_in_a_sealed_manifest(tmp_path, data, value):
     manifest = json.loads((tmp_path / "sound").read_bytes())
     del manifest["sha256"]
     put_anywhere(data, value, manifest)
-    (tmp_path / "a" / MANIFEST).write_bytes(store._sealed(manifest))
+    (tmp_path / "a" / MANIFEST).write_bytes(store.sealed(manifest))
     try:
         arrays, _ = store.read(tmp_path / "a", "policy")
     except CorruptError:

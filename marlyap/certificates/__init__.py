@@ -6,6 +6,7 @@ from marlyap.certificates.closed_form import ClosedForm
 from marlyap.certificates.composition import Composition
 from marlyap.certificates.contraction import Contraction
 from marlyap.certificates.decrease import Decrease
+from marlyap.certificates.ellipsoid import Ellipsoid
 from marlyap.certificates.linearisation import Linearisation
 from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
@@ -29,5 +30,6 @@ CERTIFICATES: dict[str, AbstractCertificate] = {
     "composition": Composition(),
     "linearisation": Linearisation(),
     "shielded": Shielded(),  # for games behind a shield only
+    "ellipsoid": Ellipsoid(),
     "closed-form": ClosedForm(),  # for the point-offset law only
 }

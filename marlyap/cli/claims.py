@@ -55,8 +55,13 @@ def about(
 
 def usual(game: AbstractGame) -> tuple[str, ...]:
     """The certificates to ask for where none is named."""
-    shielded = ("shielded",) if split(game)[1] else ()
-    return (*SAMPLED, "linearisation", *(("safe",) if has_rules(game) else ()), *shielded)
+    some = {"safe": has_rules(game), "shielded": split(game)[1] is not None}
+    return (
+        *SAMPLED,
+        "linearisation",
+        "ellipsoid",
+        *(name for name, is_so in some.items() if is_so),
+    )
 
 
 def chosen(names: Iterable[str], rollouts: int | None) -> dict[str, AbstractCertificate]:

@@ -8,7 +8,8 @@ from contextlib import suppress
 from typing import NoReturn
 
 from marlyap.cli import interrupts
-from marlyap.cli.parser import VERBS, parse, parser
+from marlyap.cli.first import FIRST
+from marlyap.cli.parser import VERBS, parse
 from marlyap.errors import UserError, explained
 
 
@@ -58,7 +59,7 @@ def command(argv: list[str]) -> int:
         print(version("marlyap"))
         return 0
     if args.verb is None:
-        parser().print_help()
+        print(FIRST, end="")
         return 0
     result, code = VERBS[args.verb].run(args, overrides)
     if args.json and result is not None:

@@ -18,7 +18,7 @@ from marlyap.controllers import CONTROLLERS, names_a_controller
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame, regulated
 from marlyap.games.perturbed import Perturbed
-from marlyap.report.contents import progress
+from marlyap.report.measuring import progress
 from marlyap.runs import config, groups
 from marlyap.runs.run import Run, expand
 from marlyap.runs.subject import asked, subject

@@ -5,15 +5,22 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from marlyap.cli import (
+    agent,
+    bag,
     bench,
     certify,
     check_task,
     demo,
     evaluate,
+    export,
     listing,
+    plot,
     recheck,
     report,
+    swarm,
+    sweep,
     train,
+    verify,
     watch,
 )
 from marlyap.cli.common import Overrides, Result
@@ -51,13 +58,20 @@ class Verb(Protocol):
 VERBS: dict[str, Verb] = {
     "demo": demo,
     "train": train,
+    "sweep": sweep,
     "evaluate": evaluate,
     "bench": bench,
     "certify": certify,
     "recheck": recheck,
     "check-task": check_task,
+    "export": export,
+    "verify": verify,
+    "agent": agent,
+    "swarm": swarm,
+    "bag": bag,
     "report": report,
     "watch": watch,
+    "plot": plot,
     "list": listing,
 }
 

@@ -27,6 +27,8 @@ def options(p: ArgumentParser) -> None:
     p.add_argument("--out", type=place, default=None, help=where)
     p.add_argument("--episodes", type=number, default=500, help="held-out starts (default 500)")
     p.add_argument("--seed", type=seed_of_starts, default=0, help=SEED)
+    beside = "the hand-written controller to film beside the runs, or none (default: the cheapest)"
+    p.add_argument("--beside", metavar="CONTROLLER", default="", help=beside)
     measured_on(p, "the task to measure on (default: that of each run)")
 
 
@@ -40,15 +42,22 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     runs, games = [run for run, _ in opened], [game for _, game in opened]
     default = runs[0].directory / "report.html" if len(runs) == 1 else Path("report.html")
     out, starts = args.out or default, starts_of(args.seed)
-    return write(runs, games, out, args.episodes, starts, args.task or ""), 0
+    return write(runs, games, out, args.episodes, starts, args.task or "", args.beside), 0
 
 
 def write(
-    runs: Sequence[Any], games: Sequence[Any], out: Path, episodes: int, starts: int, task: str = ""
+    runs: Sequence[Any],
+    games: Sequence[Any],
+    out: Path,
+    episodes: int,
+    starts: int,
+    task: str = "",
+    beside: str = "",
 ) -> dict[str, Any]:
     """The page about each run on its game, and its pictures; returns its figures.
 
-    `task` is what the user called the games, where they are not the runs' own.
+    `task` is what the user called the games, where they are not the runs' own; `beside` the
+    controller that is filmed beside them.
     """
     from marlyap.report.contents import gather
     from marlyap.report.page import html
@@ -58,7 +67,7 @@ def write(
     if out.exists() and not is_report(out):
         raise UserError(f"out: {out} exists and is not a report of marlyap; choose another file.")
     command = shlex.join(["marlyap", *sys.argv[1:]])
-    page = gather(list(runs), episodes, starts, command, list(games), task)
+    page = gather(list(runs), episodes, starts, command, list(games), task, beside)
     store.write_text_atomic(out, html(page))
     pictures = [out.with_name(f"{out.stem}-{name}") for name in ("starts.png", "learning.png")]
     trajectories_png(page.films, pictures[0])
@@ -66,11 +75,17 @@ def write(
     say(f"Report: {out.resolve()}")
     for note in page.notes:
         say(note)
-    told: list[dict[str, Any]] = [dataclasses.asdict(group) for group in page.groups]
+    told = [_printed(group) for group in page.groups]
     result: dict[str, Any] = {"start_seed": page.starts, "groups": told}
     if len(told) == 1:
         result = {k: v for k, v in told[0].items() if k != "text"} | result
     return result | {"report": str(out), "pictures": [str(p) for p in pictures]}
+
+
+def _printed(group: Any) -> dict[str, Any]:
+    """The figures of a group for --json, without what only charts show."""
+    told = dataclasses.asdict(dataclasses.replace(group, finals=(), along=None))
+    return {k: v for k, v in told.items() if k not in ("finals", "along")}
 
 
 def is_report(path: Path) -> bool:

@@ -5,7 +5,15 @@ from dataclasses import replace
 
 from marlyap.cli.common import Overrides, Result, say
 from marlyap.cli.environment import prepare
-from marlyap.cli.options import NAMED, OVERRIDES, SHIELD, Once, number, place
+from marlyap.cli.options import (
+    NAMED,
+    OVERRIDES,
+    SHIELD,
+    TRACKERS,
+    Once,
+    number,
+    place,
+)
 from marlyap.errors import UserError
 from marlyap.runs.job import Launch
 
@@ -40,11 +48,12 @@ def options(p: ArgumentParser) -> None:
     p.add_argument(
         "--on-nan", default="stop", help="when numbers diverge: stop (default) or rollback"
     )
+    p.add_argument("--log", nargs="+", default=[], help=TRACKERS)
 
 
 def run(args: Namespace, overrides: Overrides) -> Result:
     """Make the runs, or open those to be resumed, and train them."""
-    how = Launch(args.parallel, args.on_nan, args.device)
+    how = Launch(args.parallel, args.on_nan, args.device, log=tuple(args.log))
     prepare(args.device, training=True)
     from marlyap.cli import training
 

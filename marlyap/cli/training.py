@@ -1,46 +1,22 @@
 """Runs that are made, resumed and trained: what `train` and `demo` share."""
 
-import re
 import shutil
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from marlyap.cli.common import Overrides, say
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
 from marlyap.learning.algorithm import AbstractAlgorithm
-from marlyap.learning.algorithms import PRESETS
-from marlyap.learning.trainer import Trainer, schedule_for
 from marlyap.runs import config
-from marlyap.runs.job import Launch
+from marlyap.runs.asked import Asked, assemble
+from marlyap.runs.job import Launch, seeds
 from marlyap.runs.launch import launch
 from marlyap.runs.progress import show
 from marlyap.runs.run import Run, expand
 from marlyap.runs.stop import Stop
-from marlyap.runs.subject import supplies, unfolded
-from marlyap.shields import behind
-
-
-@dataclass(frozen=True)
-class Asked:
-    """What the user named: task, algorithm and preset, and the environment steps of each seed."""
-
-    task: str
-    algorithm: str
-    preset: str | None = None
-    steps: int | None = None
-    shield: bool = False  # whether it is trained behind one
-
-    @property
-    def names(self) -> dict[str, str]:
-        """As run.json holds them."""
-        return {
-            "task": self.task,
-            "algorithm": self.algorithm,
-            "preset": self.preset or "tuned",
-        }
+from marlyap.runs.subject import supplies
 
 
 def reopened(places: Iterable[Path], task: str | None, algorithm: str | None) -> list[Run]:
@@ -95,37 +71,6 @@ def create(
     for place in places.values():
         Run.vacant(place, force)
     return [Run.create(p, trainer, seed, asked.names, force) for seed, p in places.items()]
-
-
-def assemble(asked: Asked, overrides: Overrides) -> Trainer:
-    """Task, algorithm and schedule as asked for."""
-    preset = asked.names["preset"]
-    if preset not in PRESETS:
-        raise UserError(f"preset: '{preset}' is unknown; {config.suggest(preset, PRESETS)}")
-    game = config.load(asked.task, AbstractGame)
-    algorithm = PRESETS[preset](config.load(asked.algorithm, AbstractAlgorithm))
-    schedule = schedule_for(algorithm, preset)
-    parts = unfolded(game, asked.shield, overrides)
-    parts |= {"algorithm": algorithm, "schedule": schedule}
-    parts = config.override_all(parts, overrides)
-    if asked.steps is not None:
-        parts["schedule"] = config.override(parts["schedule"], "steps", str(asked.steps))
-    game = behind(parts["task"], parts.get("shield"))
-    return Trainer(game, parts["algorithm"], parts["schedule"])
-
-
-def seeds(words: list[str]) -> list[int]:
-    """The seeds asked for: whole numbers, each once."""
-    each = [w for word in words for w in word.split(",")]
-    for word in each:
-        if not re.fullmatch(r"[+-]?\d+", word.strip()):
-            raise UserError(f"seeds: '{word}' is not a whole number.")
-    numbers = [int(w) for w in each]
-    if len(set(numbers)) != len(numbers):
-        raise UserError(f"seeds: {' '.join(words)} names a seed twice.")
-    if not all(0 <= n < 2**31 for n in numbers):
-        raise UserError(f"seeds: {' '.join(words)} must lie between 0 and 2147483647.")
-    return numbers
 
 
 def trained(runs: list[Run], how: Launch, new: bool) -> int:

@@ -4,7 +4,8 @@ XLA keeps what it has compiled, but to find it there JAX has to trace and lower 
 which takes longer at every start than all the rest. Here the lowered program is kept, by
 `jax.export`, as a stored directory whose name is a digest of all that it was made from: every
 source file of this package, the versions of what it uses, the settings of JAX, the device, the
-trainer with its whole configuration, and the shapes of the arrays.
+trainer with its configuration, and the shapes of the arrays. Numbers that the trainer holds as
+arrays (`learning.traced`) are arguments of the program and no part of its name.
 
 It is done where the environment variable MARLYAP_PROGRAMS names a folder, as it does for the
 command line, and for programs made of this package alone: of code of your own nothing tells whether
@@ -17,7 +18,7 @@ import os
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -48,28 +49,33 @@ def compiled(
 ) -> Callable[[Any], tuple[Tree, Info]]:
     """`f(maker, .)` compiled for arguments shaped as this one; with `donate` they are used up.
 
-    f returns a tree and a dict of arrays; `like()` has the tree's structure, with arrays or their
-    shapes, and all that is not an array.
+    The arrays in `maker` are arguments as well, which are kept: the program is that of all makers
+    that differ in their values alone. f returns a tree and a dict of arrays; `like()` has the
+    tree's structure, with arrays or their shapes, and all that is not an array.
     """
     folder = os.environ.get(FOLDER)
     given, fixed = eqx.partition(argument, _has_shape)
     leaves, structure = jax.tree.flatten(given)
+    numbers, maker_without = eqx.partition(maker, _has_shape)
+    known, structure_of_maker = jax.tree.flatten(numbers)
     if not folder or jax.device_count() > 1 or not (_ours(maker) and _ours(fixed)):
         return lambda argument: _traced(f, donate)(maker, argument)
-    shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
+    shapes = [[jax.ShapeDtypeStruct(x.shape, x.dtype) for x in xs] for xs in (leaves, known)]
 
-    def flat(leaves):
-        tree, info = f(maker, eqx.combine(structure.unflatten(leaves), fixed))
+    def flat(leaves, known):
+        made = eqx.combine(structure_of_maker.unflatten(known), maker_without)
+        tree, info = f(made, eqx.combine(structure.unflatten(leaves), fixed))
         return jax.tree.leaves(eqx.filter(tree, _has_shape)), info
 
-    about = [f.__qualname__, as_json(maker), words(argument).tobytes().decode(), str(structure)]
-    place = Path(folder, _digest(*about, [str(s) for s in shapes], donate))
-    run = jax.jit(_kept(place, flat, shapes).call, donate_argnums=0 if donate else ())
+    about = [f.__qualname__, as_json(maker_without), str(structure_of_maker)]
+    about += [words(argument).tobytes().decode(), str(structure)]
+    place = Path(folder, _digest(*about, str(shapes), donate))
+    run = _kept(place, flat, shapes, donate)
     shaped, fixed_after = eqx.partition(like(), _has_shape)
     structure_after = jax.tree.structure(shaped)
 
     def call(argument):
-        leaves, info = run(jax.tree.leaves(eqx.filter(argument, _has_shape)))
+        leaves, info = run(jax.tree.leaves(eqx.filter(argument, _has_shape)), known)
         return eqx.combine(structure_after.unflatten(leaves), fixed_after), info
 
     return call
@@ -80,21 +86,35 @@ def _traced(f: Callable[..., Any], donate: bool) -> Callable[..., Any]:
     return eqx.filter_jit(f, donate="all-except-first" if donate else "none")
 
 
-def _kept(place: Path, f: Callable[..., Any], shapes: list[Any]) -> export.Exported:
+def _kept(place: Path, f: Callable[..., Any], shapes: list[Any], donate: bool) -> Any:
     """The program kept there; where there is none, or it is damaged, `f` is traced and kept."""
-    with suppress(UserError):
-        arrays, _ = store.read(place, KIND)
+    with suppress(UserError, OSError):
+        run = _loaded(place, os.stat(place / store.PAYLOAD).st_mtime_ns, donate)
         with suppress(OSError):
             os.utime(place)
-        return export.deserialize(bytearray(arrays["exported"].tobytes()))
-    made = export.export(jax.jit(f))(shapes)
+        return run
+    made = export.export(jax.jit(f))(*shapes)
     with suppress(UserError, OSError):  # a disk that is full or read-only takes nothing but time
         place.parent.mkdir(parents=True, exist_ok=True)
         store.write(
             place, KIND, {"exported": np.frombuffer(made.serialize(), np.uint8)}, {}, replace=True
         )
         _forget(place.parent)
-    return made
+    return _compiled(made, donate)
+
+
+@lru_cache(maxsize=16)
+def _loaded(place: Path, written: int, donate: bool) -> Any:
+    """The program as it was written then, compiled once for all that this process trains with it.
+
+    Raises UserError where it cannot be read.
+    """
+    arrays, _ = store.read(place, KIND)
+    return _compiled(export.deserialize(bytearray(arrays["exported"].tobytes())), donate)
+
+
+def _compiled(program: export.Exported, donate: bool) -> Any:
+    return jax.jit(program.call, donate_argnums=0 if donate else ())
 
 
 def _forget(folder: Path) -> None:

@@ -828,6 +828,17 @@ def failure(probe: Probe) -> Faults:
             )
 
 
+def channels(probe: Probe) -> Faults:
+    """The named channels of an observation, where a task tells them, add up to its size."""
+    told, there = probe.game.channels(), probe.seen["obs"].shape[-1]
+    size = sum(channel.size for channel in told)
+    if told and size != there:
+        yield (
+            f"observation_entries: they name {size} numbers, and an observation has {there}; name "
+            "each of them, in their order."
+        )
+
+
 LAWS: tuple[Callable[[Probe], Faults], ...] = (
     finite,
     deterministic,
@@ -849,4 +860,5 @@ LAWS: tuple[Callable[[Probe], Faults], ...] = (
     time_limit,
     termination,
     failure,
+    channels,
 )

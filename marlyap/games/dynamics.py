@@ -76,7 +76,9 @@ class AbstractDynamics(eqx.Module):
         x = jnp.zeros(self.dx).at[jnp.array([0, 1])].set(position)
         return x.at[2].set(angle) if "psi" in self.names else x
 
-    def step(self, x: Float[Array, "dx"], u: Float[Array, "du"], dt: float) -> Float[Array, "dx"]:
+    def step(
+        self, x: Float[Array, "dx"], u: Float[Array, "du"], dt: float | Array
+    ) -> Float[Array, "dx"]:
         """x after `dt` seconds of constant inputs u, in physical units."""
         return integrate(lambda x: self.field(x, u), x, dt, self.integrator, self.blocks)
 
@@ -84,7 +86,7 @@ class AbstractDynamics(eqx.Module):
         """The inputs, in physical units, that an action in [-1, 1]^du asks for."""
         return jnp.clip(action, -1.0, 1.0) * jnp.asarray(self.limits)
 
-    def predict(self, x: Float[Array, "dx"], dt: float) -> Float[Array, "dx"]:
+    def predict(self, x: Float[Array, "dx"], dt: float | Array) -> Float[Array, "dx"]:
         """The state in which an input asked for now begins to act: x, where none is late.
 
         A law fed with it instead of x is a Smith predictor without model error.

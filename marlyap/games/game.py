@@ -23,7 +23,11 @@ from jaxtyping import Array, Bool, Float, Int
 from marlyap import graph as graphs
 from marlyap.errors import UserError, whole_fields
 from marlyap.games.physics import AbstractPlant
-from marlyap.types import Action, Entry, Features, Key, Links, Obs, Scalar, Scene, State
+from marlyap.games.sensing import Sight
+from marlyap.types import Action, Channel, Entry, Features, Key, Links, Obs, Scalar, Scene, State
+
+
+AXES = ("ahead", "left", "up", "x", "y", "z")  # by which the names of a vector's entries differ
 
 
 class AbstractGame(eqx.Module):
@@ -227,11 +231,35 @@ class AbstractGame(eqx.Module):
         """Name, unit and frame of every error."""
         return ()
 
+    @property
+    def nominal(self) -> "AbstractGame":
+        """The same without what a wrapper lets go wrong: what a team is deployed in."""
+        return self
+
+    def sight(self) -> Sight | None:
+        """How a robot makes its own observation; None where only the game can make it."""
+        return None
+
     # What follows from that; final.
 
     def observations(self, state: State) -> Obs:
         """What every agent sees in this state, over the links that this game has there."""
         return self.observe(state, self.linked(state))
+
+    def channels(self) -> tuple[Channel, ...]:
+        """The entries of an observation, those side by side that differ in their axis as one.
+
+        Their sizes add up to that of an observation; where a task tells no entries there is none.
+        """
+        found: list[Channel] = []
+        for entry in self.observation_entries():
+            stem, _, last = entry.name.rpartition(", ")
+            alike = Channel(stem if last in AXES else entry.name, 1, entry.unit, entry.frame)
+            if last in AXES and found and found[-1]._replace(size=1) == alike:
+                found[-1] = found[-1]._replace(size=found[-1].size + 1)
+            else:
+                found.append(alike)
+        return tuple(found)
 
     def step(self, state: State, action: Action) -> State:
         """s_{t+1} = f(s_t, a_t) for actions in [-1, 1] (Assumption 2)."""

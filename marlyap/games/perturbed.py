@@ -13,7 +13,7 @@ from marlyap.games.game import AbstractGame, AbstractRegulation
 from marlyap.games.physics import AbstractPlant
 from marlyap.games.wrapper import AbstractWrapper
 from marlyap.seeds import branch
-from marlyap.types import State
+from marlyap.types import Action, State
 
 
 class Perturbed(AbstractWrapper):
@@ -41,6 +41,9 @@ class Perturbed(AbstractWrapper):
     push: float | Array = 0.0  # every so often all rates of an agent jump by + or - this (SI)
     jump: float | Array = 0.0  # every so often the target moves anywhere in [-jump, jump]^2 (m)
     every: int = 40  # steps from one push or jump to the next
+    silent: float = 0.0  # probability that in an episode a follower stops and falls silent
+    late: float = 0.0  # s up to which, drawn anew each episode, inputs act late; less than dt
+    measured: float = 0.0  # standard deviation of what is measured of the states, in their units
 
     def __check_init__(self):
         if not 0 < self.gain < 100 or not 0 < self.spread < 100:
@@ -49,6 +52,7 @@ class Perturbed(AbstractWrapper):
             raise UserError("perturbation: noise, delay and drop must not be negative, drop <= 1.")
         if not 0 <= self.push < 1e6 or not 0 <= self.jump < 1e6 or self.every < 1:
             raise UserError("perturbation: push and jump must not be negative, every at least 1.")
+        self._robots()
         missing = {*self.gone, *(i for edge in self.cut for i in edge)}
         if not missing <= set(range(self.inner.agents)):
             raise UserError(f"perturbation: {sorted(missing)} names an agent that is not there.")
@@ -63,6 +67,22 @@ class Perturbed(AbstractWrapper):
                 f"perturbation: an agent of {own[0]} cannot be taken away, since it replaces "
                 f"`{own[1]}`, which judges the whole team; leave out gone."
             )
+
+    def _robots(self) -> None:
+        """Raise UserError unless the last three fields are in range and about robots."""
+        if not 0 <= self.silent <= 1 or not 0 <= self.late < self.inner.dt or self.measured < 0:
+            raise UserError(
+                "perturbation: silent must lie between 0 and 1, late between 0 and dt, and "
+                "measured must not be negative."
+            )
+        plain = type(self.inner).step is AbstractGame.step and self.inner.sight() is not None
+        if (self.silent or self.late or self.measured) and not plain:
+            raise UserError(
+                f"perturbation: {type(self.inner).__name__} is no game of robots in the plane with "
+                "the step of all games; leave out silent, late and measured."
+            )
+        if self.silent and self.inner.leads.all():
+            raise UserError("perturbation: nobody but leaders is there; leave out silent.")
 
     # What the game inside says.
     agents = property(lambda self: self.inner.agents)  # pyright: ignore[reportAssignmentType]
@@ -106,6 +126,7 @@ class Perturbed(AbstractWrapper):
         idle = self.driven.hold(start)
         queue = jnp.broadcast_to(idle, (self.delay, *idle.shape))
         memory = {"seed": jax.random.key_data(seed), "queue": queue, "inner": start.memory}
+        memory |= {"last": idle} if self.late else {}
         return State(x=start.x, scenario=start.scenario, t=start.t, memory=memory)
 
     def linked(self, state):
@@ -118,21 +139,57 @@ class Perturbed(AbstractWrapper):
     def underway(self, state):
         return jnp.concatenate([super().underway(state), state.memory["queue"]])
 
+    def observe(self, state, links):
+        inside = self.inside(state)
+        if self.measured:
+            key = jax.random.fold_in(self._key(state, 4), state.t)
+            x = inside.x + self.measured * jax.random.normal(key, inside.x.shape)
+            inside = eqx.tree_at(lambda s: s.x, inside, x)
+        return self.inner.observe(inside, links)
+
     def step(self, state, action):
         queue = jnp.concatenate([state.memory["queue"], action[None]])
         now, key = queue[0], jax.random.fold_in(self._key(state, 2), state.t)
         if _on(self.noise):
             now = now + self.noise * jax.random.normal(key, now.shape)
-        after = self.driven.step(self._struck(state), now)
+        before = self._struck(state)
+        late = lambda: self._acting_late(state, before, now)
+        after = late() if self.late else self.driven.step(before, now)
         memory = state.memory | {"queue": queue[1:], "inner": after.memory}
-        return State(x=after.x, scenario=after.scenario, t=after.t, memory=memory)
+        memory |= {"last": now} if self.late else {}
+        x = self._stopped(state, before.x, after.x) if self.silent else after.x
+        return State(x=x, scenario=after.scenario, t=after.t, memory=memory)
+
+    def _acting_late(self, state: State, before: State, action: Action) -> State:
+        """The step from `before` in which the last action still acts at first."""
+        plant = self.plant
+        late = jax.random.uniform(self._key(state, 5), (), maxval=self.late)
+        time, x = before.t * self.dt, before.x
+        for asked, seconds in ((state.memory["last"], late), (action, self.dt - late)):
+            x = plant.step(x, plant.inputs_of(asked), before.scenario, time, seconds)
+        return State(x=x, scenario=before.scenario, t=before.t + 1, memory=before.memory)
+
+    def _stopped(self, state: State, before: Array, after: Array) -> Array:
+        """Whoever is silent stands where it was: what its neighbours take it for."""
+        angle = before[:, 2] if "psi" in self.dynamics.names else jnp.zeros(self.agents)
+        still = jax.vmap(self.dynamics.rest)(self.inner.positions(self.inside(state)), angle)
+        return jnp.where(self.silenced(state)[:, None], still, after)
+
+    def silenced(self, state: State) -> Bool[Array, "agent"]:
+        """Who has stopped and fallen silent by now: at most one follower, from some step on."""
+        k_whether, k_who, k_when = jax.random.split(self._key(state, 3), 3)
+        followers = jnp.asarray(np.flatnonzero(~self.inner.leads))
+        who = jax.random.choice(k_who, followers)
+        when = jax.random.randint(k_when, (), 0, self.horizon)
+        gone = jax.random.bernoulli(k_whether, self.silent) & (state.t >= when)
+        return gone & (jnp.arange(self.agents) == who)
 
     def _struck(self, state: State) -> State:
         """The state inside, pushed or with another target where the time for it has come."""
         inside, due = self.inside(state), (state.t > 0) & (state.t % self.every == 0)
-        for size, purpose in ((self.push, 4), (self.jump, 5)):
+        for size, purpose in ((self.push, 6), (self.jump, 7)):
             if _on(size):
-                strike = self.inner.pushed if purpose == 4 else self.inner.retargeted
+                strike = self.inner.pushed if purpose == 6 else self.inner.retargeted
                 key = jax.random.fold_in(self._key(state, purpose), state.t)
                 struck = strike(inside, size, key)
                 inside = jax.tree.map(lambda a, b: jax.lax.select(due, a, b), struck, inside)
@@ -146,28 +203,32 @@ class Perturbed(AbstractWrapper):
         return self.driven.hold(self.inside(state))
 
     def distance(self, state):
-        return self._of_those_present(self.inner.distance(self.inside(state)))
+        return self._judged(state, self.inner.distance(self.inside(state)))
 
     def costs(self, state, action):
-        return self._of_those_present(self.inner.costs(self.inside(state), action))
+        return self._judged(state, self.inner.costs(self.inside(state), action))
 
     def rewards(self, state, action):
-        return self._of_those_present(self.inner.rewards(self.inside(state), action))
+        return self._judged(state, self.inner.rewards(self.inside(state), action))
 
     def errors(self, state):
         errors = self.inner.errors(self.inside(state))
-        return jnp.where(jnp.asarray(self.present)[:, None], errors, 0.0)
+        return jax.vmap(lambda e: self._judged(state, e), 1, 1)(errors)
 
     def success(self, state):
-        return AbstractGame.success(self, state) if self.gone else super().success(state)
+        some = self.gone or self.silent
+        return AbstractGame.success(self, state) if some else super().success(state)
 
     def violations(self, state):
         # Nobody collides with an agent that is gone.
         there = self.inner.violations(self.inner.aside(self.inside(state), ~self.present))
         return there & jnp.asarray(self.present)
 
-    def _of_those_present(self, values: Float[Array, "agent"]) -> Float[Array, "agent"]:
-        return jnp.where(jnp.asarray(self.present), values, 0.0)
+    def _judged(self, state: State, values: Float[Array, "agent"]) -> Float[Array, "agent"]:
+        """The values of those who are there and can act, 0 of the others."""
+        there = jnp.asarray(self.present)
+        there = there & ~self.silenced(state) if self.silent else there
+        return jnp.where(there, values, 0.0)
 
     def _key(self, state: State, purpose: int) -> Array:
         return jax.random.fold_in(jax.random.wrap_key_data(state.memory["seed"]), purpose)

@@ -55,7 +55,9 @@ class AbstractPlant(eqx.Module):
         """The inputs, in their units, that actions in [-1, 1] ask for; beyond that they clip."""
         return jnp.clip(action, -1.0, 1.0) * jnp.asarray(self.limits)[None]
 
-    def step(self, x: PyTree, u: Inputs, scenario: PyTree, time: Scalar, dt: float) -> PyTree:
+    def step(
+        self, x: PyTree, u: Inputs, scenario: PyTree, time: Scalar, dt: float | Array
+    ) -> PyTree:
         """x after `dt` seconds of constant inputs."""
         return integrate(
             lambda x: self.field(x, u, scenario, time), x, dt, self.integrator, self.blocks
@@ -75,14 +77,18 @@ def check_inputs(
 
 
 def integrate(
-    f: Field, x: Array, dt: float, integrator: Integrator, blocks: tuple[tuple[int, ...], ...]
+    f: Field,
+    x: Array,
+    dt: float | Array,
+    integrator: Integrator,
+    blocks: tuple[tuple[int, ...], ...],
 ) -> Array:
     """x [..., dx] after `dt` seconds of x' = f(x)."""
     return semi_implicit_euler(f, x, dt, blocks) if integrator == "euler" else rk4(f, x, dt)
 
 
 def semi_implicit_euler(
-    f: Field, x: Array, dt: float, blocks: tuple[tuple[int, ...], ...]
+    f: Field, x: Array, dt: float | Array, blocks: tuple[tuple[int, ...], ...]
 ) -> Array:
     """Velocities first, then what they move, each block with the values already new."""
     for block in blocks:
@@ -91,7 +97,7 @@ def semi_implicit_euler(
     return x
 
 
-def rk4(f: Field, x: Array, dt: float) -> Array:
+def rk4(f: Field, x: Array, dt: float | Array) -> Array:
     """The classical fourth-order Runge-Kutta step."""
     k1 = f(x)
     k2 = f(x + dt / 2 * k1)

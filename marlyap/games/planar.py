@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from marlyap.errors import UserError, whole_fields
 from marlyap.games.dynamics import AbstractDynamics, Independent
 from marlyap.games.game import AbstractRegulation, Tolerance
-from marlyap.games.sensing import body_frame, body_frame_entries, into_frame, near
+from marlyap.games.sensing import Sight, body_frame, body_frame_entries, into_frame, near
 from marlyap.types import Entry, Links, Obs, Scene, State
 
 
@@ -169,6 +169,10 @@ class AbstractPlanar(AbstractRegulation):
         slots, leads = jnp.asarray(self.slots), jnp.asarray(self.leads)
         goals = self.goals(state)
         return body_frame(self.dynamics, state.x, goals, slots, links, leads, self.radius, headings)
+
+    def local_sight(self, headings: bool = False) -> Sight:
+        """How a robot makes its row of `local_view` itself: for `sight`."""
+        return Sight(self.radius, headings, np.zeros((self.agents, 2)))
 
     def local_entries(self, headings: bool = False) -> tuple[Entry, ...]:
         """What the entries of `local_view` are: for `observation_entries`."""

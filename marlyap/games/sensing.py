@@ -4,12 +4,26 @@ A turn or a shift of the whole scene changes nothing (SE(2) invariance), and not
 agent itself and its neighbours enters (locality).
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from marlyap.games.dynamics import AbstractDynamics
 from marlyap.types import Entry, Links, Obs
+
+
+class Sight(NamedTuple):
+    """How a robot itself makes its row of `body_frame`, of what it measures and hears.
+
+    `places` are subtracted from all positions before they are compared.
+    """
+
+    scale: float  # at which gaps are magnified (m)
+    headings: bool  # whether neighbours tell their headings
+    places: Float[np.ndarray, "agent 2"]  # m
 
 
 def noise(

@@ -97,6 +97,13 @@ class AbstractWrapper(AbstractRegulation):
     def lasting(self, horizon):
         return dataclasses.replace(self, inner=self.inner.lasting(horizon))
 
+    @property
+    def nominal(self):
+        return self.inner.nominal
+
+    def sight(self):
+        return self.inner.sight()
+
     def observation_entries(self):
         return self.inner.observation_entries()
 

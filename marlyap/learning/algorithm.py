@@ -4,7 +4,6 @@ import abc
 from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
@@ -13,6 +12,7 @@ from marlyap.learning.health import Health
 from marlyap.learning.replay import Episode
 from marlyap.learning.schedule import Schedule
 from marlyap.learning.source import CostWindow, Play
+from marlyap.learning.traced import AbstractTraced
 from marlyap.nets.nets import LyapunovNet, NormNet, Shape
 from marlyap.simulation.rollout import AbstractExplorer, Policy
 from marlyap.types import Key, Scalar
@@ -41,7 +41,7 @@ class Info(NamedTuple):
     seen: PyTree = None  # what `watch` returned, with a leading axis `update`
 
 
-class AbstractAlgorithm(eqx.Module):
+class AbstractAlgorithm(AbstractTraced):
     """Owns its iteration. The fields of a subclass are its hyperparameters and its configuration.
 
     `networks` are all that gradients move, with the optimisers' states; a `learner` is the networks

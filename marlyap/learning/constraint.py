@@ -2,16 +2,16 @@
 
 import abc
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from marlyap.learning.source import CostWindow
+from marlyap.learning.traced import AbstractTraced
 from marlyap.nets.nets import LyapunovNet, NormNet, Sample, Shape
 from marlyap.types import Key, Scalar, Transition
 
 
-class AbstractConstraint(eqx.Module):
+class AbstractConstraint(AbstractTraced):
     """A term of the policy objective (`penalty`) and how its parts are learnt (`update`)."""
 
     @property

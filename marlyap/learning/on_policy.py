@@ -102,8 +102,8 @@ def advantages(
     reward: Float[Array, "time agent"],
     value: Float[Array, "time+1 agent"],
     terminated: Bool[Array, "time"],
-    gamma: float,
-    trace: float,
+    gamma: Scalar | float,
+    trace: Scalar | float,
 ) -> Float[Array, "time agent"]:
     """Generalised advantage estimates (Schulman et al. 2016, eq. 16).
 

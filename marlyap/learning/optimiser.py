@@ -79,7 +79,7 @@ def in_parts(f: Callable[[PyTree], PyTree], batch: PyTree, parts: int) -> PyTree
     return jax.lax.map(f, batch, batch_size=size)
 
 
-def polyak(new: M, old: M, tau: float) -> M:
+def polyak(new: M, old: M, tau: Scalar | float) -> M:
     """tau theta + (1 - tau) theta-bar, leaf by leaf."""
     mix = lambda n, o: tau * n + (1 - tau) * o if eqx.is_inexact_array(n) else n
     return jax.tree.map(mix, new, old)

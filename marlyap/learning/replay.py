@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from marlyap.types import Key, Transition
+from marlyap.types import Key, Scalar, Transition
 
 
 class Episode(eqx.Module):
@@ -62,7 +62,7 @@ class Replay(eqx.Module):
         size = jnp.minimum(self.size + count, self.rows)
         return Replay(episodes, (self.head + count) % self.rows, size)
 
-    def sample(self, key: Key, batch: int, gamma: float, n: int = 1) -> Transition:
+    def sample(self, key: Key, batch: int, gamma: Scalar | float, n: int = 1) -> Transition:
         """B ~ D: `batch` transitions with n-step rewards, each step equally likely."""
         k_where, k_noise = jax.random.split(key)
         most = jnp.stack([self.size, jnp.asarray(self.time)]).astype(jnp.uint32)[:, None]
@@ -78,7 +78,7 @@ class Replay(eqx.Module):
         row: Int[Array, ""],
         t: Int[Array, ""],
         noise: Float[Array, "agent 2 du"],
-        gamma: float,
+        gamma: Scalar | float,
         n: int = 1,
     ) -> Transition:
         """The step t of one episode; fewer than n steps are summed where the episode is cut.

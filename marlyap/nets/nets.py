@@ -168,7 +168,7 @@ class Noisy(AbstractExplorer):
     """The deterministic policy with Gaussian noise added, clipped to what can be done."""
 
     pi: Actors
-    std: float
+    std: Scalar | float
 
     def __call__(self, obs: Obs, key: Key) -> Action:
         mode = self.pi.mode(obs)

@@ -51,6 +51,7 @@ ASKED = {
     "Apart": SAMPLED | dict(calibration=WHOLE, stay=WHOLE, least=NUMBER),
     "Linearisation": dict(scenes=WHOLE, margin=NUMBER, decay=NUMBER),
     "Shielded": dict(rollouts=WHOLE),
+    "Ellipsoid": dict(scenes=WHOLE),
     "Proof": dict(c=NUMBER, rho=NUMBER, inner=NUMBER, half=LIST, eta=NUMBER, decay=NUMBER)
     | dict(most=WHOLE, batch=WHOLE, resume=(str, NONE), show=FLAG),
 }
@@ -262,7 +263,7 @@ def left_out(
     fits |= {"Contraction": say.too_long(int(T[1]))} if T and int(T[1]) > say.H else {}
     if fits.get(kind) == why:
         return {}
-    if kind in ("ClosedForm", "Proof"):
+    if kind in ("ClosedForm", "Ellipsoid", "Proof"):
         return {name: "it was left out, and whether it had to be is not known here"}
     raise Rejected(f"certificate: the reason for leaving out {name} is not true.")
 
@@ -278,6 +279,8 @@ def unchecked(sim: World, kind: str) -> str:
         raise Rejected("certificate: safe is about rules, and a rendezvous has none.")
     if kind == "Shielded":
         raise Rejected("certificate: shielded is about games behind a shield, and this has none.")
+    if kind == "Ellipsoid":
+        return "a proof by intervals is not repeated here; repeat it with marlyap certify"
     if sim.game["agents"] != 1:
         raise Rejected("certificate: a proof is about one agent, and the game has more.")
     return "a proof over boxes is not repeated here; repeat it with experiments/proof.py"

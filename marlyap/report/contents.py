@@ -16,27 +16,20 @@ from marlyap.report.data import (
     Difference,
     Film,
     Group,
-    LogRow,
     Page,
-    Share,
     Slice,
-    Trained,
     Training,
-    Within,
 )
-from marlyap.report.episodes import films, worst_case
+from marlyap.report.episodes import worst_case
+from marlyap.report.filming import Lead, filmed
+from marlyap.report.measuring import history, measured, progress
 from marlyap.report.slices import slices
 from marlyap.runs import groups
 from marlyap.runs.run import Run
-from marlyap.simulation.evaluation import evaluate
 from marlyap.storage import store
 from marlyap.storage.hashing import as_json, policy_hash
 
 
-MEASURED = (
-    "Measured, not proved: the interval is about {what} in this simulation, from starts drawn as "
-    "in training. {more}"
-)
 MOST_FILMED = 4  # configurations, the first run of each
 MOST_COMPARED = 12
 
@@ -48,92 +41,53 @@ def gather(
     command: str = "",
     games: Sequence[AbstractGame] | None = None,
     called: str = "",
+    beside: str = "",
 ) -> Page:
     """Everything that a report shows of these runs.
 
     `games` has the game that each is measured on, by default its own, and `called` is the name of
-    that game where it is not the one that a run was trained on.
+    that game where it is not the one that a run was trained on. `beside` names the hand-written
+    controller that is filmed beside them (`filming.filmed`).
     """
-    found = []
-    for run, game in zip(runs, games or [run.game for run in runs], strict=True):
-        result = evaluate(game, run.controller(game), episodes, seed)
-        found.append(groups.of_run(run, result, seed, game, called))
-    names, labels = groups.labels(found, brief=True)
-    team_of = dict(zip(names, groups.grouped(found).values(), strict=True))
-    of = {m.name: (run, label) for m, run, label in zip(found, runs, labels, strict=True)}
+    told = measured(runs, episodes, seed, games, called)
     alone = len(runs) == 1
-    whose = lambda m: "" if alone else of[m.name][1]
-    certified = [certificates(of[m.name][0], m.game, whose(m)) for m in found]
+    whose = lambda m: "" if alone else told.label(m)
+    certified = [certificates(told.run(m), m.game, whose(m)) for m in told.found]
     shown = [claim for c in certified for claim in c.claims]
-    teams = [_group(name, members, bool(shown)) for name, members in team_of.items()]
-    leads = [members[0] for members in team_of.values()][:MOST_FILMED]
-    filmed = [shot for m in leads for shot in films(of[m.name][0], m, whose(m))]
-    apart = groups.differing([members[0].configuration for members in team_of.values()])
+    teams = told.grouped(certified=bool(shown))
+    named = lambda m: told.run(m).labels["algorithm"] if alone else told.label(m)
+    firsts = [those[0] for those in told.teams.values()]
+    leads = [Lead(told.run(m), m, named(m)) for m in firsts[:MOST_FILMED]]
+    apart = groups.side_by_side([m.configuration for m in firsts])
     notes = [
         note
-        for m, c in zip(found, certified, strict=True)
-        for note in (*_missing(of[m.name][0]), *c.notes)
+        for m, c in zip(told.found, certified, strict=True)
+        for note in (*_missing(told.run(m)), *c.notes)
     ]
     return Page(
-        title=_title(runs, found),
-        subtitle=_subtitle(found, teams),
+        title=_title(runs, told.found),
+        subtitle=_subtitle(told.found, teams),
         generated=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
         starts=seed,
         groups=tuple(teams),
-        runs=tuple(
-            _trained(of[m.name][0], m, of[m.name][1], name)
-            for name, members in team_of.items()
-            for m in members
-        ),
-        films=(*filmed, *(shot for c in certified for shot in c.films)),
+        runs=told.trained(),
+        films=(*filmed(leads, beside), *(shot for c in certified for shot in c.films)),
         comparisons=tuple(
-            Comparison(of[p["a"]][1], of[p["b"]][1], p["only_a"], p["only_b"], p["p_value"])
-            for p in groups.comparisons(found)[:MOST_COMPARED]
+            Comparison(
+                told.labels[p["a"]], told.labels[p["b"]], p["only_a"], p["only_b"], p["p_value"]
+            )
+            for p in groups.comparisons(told.found)[:MOST_COMPARED]
         ),
         claims=tuple(shown),
         slices=tuple(part for c in certified for part in c.slices),
         notes=tuple(notes),
-        config=common([m.configuration for m in found]),
+        config=common([m.configuration for m in told.found]),
         changed=tuple(sorted({name for run in runs for name in changed_fields(run)})),
-        differing=tuple(
-            Difference(name, fields)
-            for name, fields in zip(team_of, apart, strict=True)
-            if len(team_of) > 1
-        ),
-        training=tuple(_training(run, label) for run, label in of.values()),
+        differing=tuple(Difference(name, values) for name, values in apart),
+        training=tuple(_training(told.run(m), told.label(m)) for m in told.found),
         versions=store.versions(),
         command=command,
     )
-
-
-def figures(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of `data.Figures` out of the summary of an evaluation or a group."""
-    known = [name for name in groups.SHARES if name in summary]
-    shares = {name: Share(**_about_share(summary[name])) for name in known}
-    within = [Within(radius=r["radius"], **_about_share(r)) for r in summary["radii"]]
-    return {**summary, **shares, "radii": tuple(within)}
-
-
-def _about_share(part: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: part[name] for name in ("episodes", "successes", "success_rate", "interval")}
-
-
-def _group(label: str, members: Sequence[groups.Measured], certified: bool) -> Group:
-    """What is said of runs that belong together."""
-    said = groups.summary(members)
-    text = _caveat(said["about"], certified)
-    return Group(label=label, text=text, **figures(said))
-
-
-def _trained(run: Run, measured: groups.Measured, label: str, group: str) -> Trained:
-    """One run, what its evaluation found and what its log says."""
-    log = tuple(
-        LogRow(line["steps"], line.get("success"), line.get("return"))
-        for line in history(run)[0]
-        if "steps" in line
-    )
-    said = figures(measured.evaluation.summary())
-    return Trained(name=measured.name, label=label, group=group, seed=run.seed, log=log, **said)
 
 
 def _title(runs: Sequence[Run], found: Sequence[groups.Measured]) -> str:
@@ -151,18 +105,6 @@ def _subtitle(found: Sequence[groups.Measured], teams: Sequence[Group]) -> str:
     parts.append(count(len(found), "run"))
     parts += [count(len(teams), "configuration")] * (len(teams) > 1)
     return "; ".join(parts)
-
-
-def _caveat(about: str, certified: bool) -> str:
-    """What the interval is about, and what is certified beside it."""
-    one = about == "this policy"
-    what = "the share of starts from which this policy succeeds"
-    if not one:
-        what = "the expected success rate of a policy that is trained with a new seed,"
-    more = "What is certified, and on what evidence, stands below."
-    return MEASURED.format(
-        what=what, more=more if certified else "Stability is not certified by it."
-    )
 
 
 def _missing(run: Run) -> list[str]:
@@ -189,30 +131,6 @@ def _training(run: Run, label: str) -> Training:
         policy=policy_hash(run.controller())[:12],
         versions={str(k): str(v) for k, v in versions.items()},
     )
-
-
-def progress(run: Run) -> tuple[int, int]:
-    """Environment steps done, by the log where the checkpoints are gone, and steps in all."""
-    steps = [line["steps"] for line in history(run)[0] if isinstance(line.get("steps"), int)]
-    whole = run.trainer.iterations * run.trainer.steps_per_iteration
-    return max([run.steps_done, *steps[-1:]]), whole
-
-
-def history(run: Run) -> tuple[list[dict[str, Any]], str]:
-    """The log of a run as far as it can be read, and in words what it lacks."""
-    try:
-        lines = run.history()
-    except UserError as error:
-        return [], f"log.jsonl cannot be read ({error})"
-    if not lines:
-        return [], "log.jsonl is missing, empty or cut off"
-    policy = run.directory / "policy"
-    logged, known = lines[-1].get("iteration", 0), 0
-    if policy.is_dir():
-        known = store.read(policy, "policy")[1].get("iteration", 0)
-    if logged < known:
-        return lines, f"log.jsonl ends at iteration {logged} of {known}"
-    return lines, ""
 
 
 @dataclass(frozen=True)
@@ -248,12 +166,14 @@ def certificates(run: Run, game: AbstractGame, label: str) -> Certified:
         V = CostSum(controller=controller, T=meta["V"]["T"], ball=meta["V"]["ball"])
     worst: dict[tuple[str, int], list[str]] = {}
     for name, verdict in meta["verdicts"].items():
-        case = verdict["worst"] or {}
-        if {"purpose", "episode"} <= {*case} and "change" not in case:
-            worst.setdefault((case["purpose"], case["episode"]), []).append(name)
+        if (case := _worst(verdict)) is not None:
+            worst.setdefault(case, []).append(name)
+    named = lambda case: "" if case is None else f"worst case {run.directory} {case[0]} {case[1]}"
     level = meta["verdicts"].get("basin", {}).get("figures", {}).get("level")
     return Certified(
-        claims=tuple(_claim(name, v, label) for name, v in meta["verdicts"].items()),
+        claims=tuple(
+            _claim(name, v, label, named(_worst(v))) for name, v in meta["verdicts"].items()
+        ),
         films=tuple(
             worst_case(
                 there,
@@ -262,7 +182,8 @@ def certificates(run: Run, game: AbstractGame, label: str) -> Certified:
                 meta["seed"],
                 *case,
                 label=f"worst for {', '.join(names)}",
-                run=label,
+                run=label or run.labels["algorithm"],
+                shot=named(case),
             )
             for case, names in worst.items()
         ),
@@ -270,14 +191,22 @@ def certificates(run: Run, game: AbstractGame, label: str) -> Certified:
     )
 
 
-def _claim(name: str, verdict: Mapping[str, Any], run: str) -> Claim:
-    """A verdict as it is shown."""
+def _worst(verdict: Mapping[str, Any]) -> tuple[str, int] | None:
+    """The start of the worst case of a verdict, if it can be played again."""
+    case = verdict["worst"] or {}
+    known = {"purpose", "episode"} <= {*case} and "change" not in case
+    return (case["purpose"], case["episode"]) if known else None
+
+
+def _claim(name: str, verdict: Mapping[str, Any], run: str, shot: str) -> Claim:
+    """A verdict as it is shown; `shot` is the film of its worst case."""
     known = {k.replace("_", " "): v for k, v in verdict["scope"].items() if v is not None}
     said = {k: verdict[k] for k in ("claim", "evidence", "holds", "bound", "confidence")}
     asked, bound = verdict["figures"].get("share_asked"), verdict["bound"]
     return Claim(
         name=name,
         run=run,
+        shot=shot,
         asked=asked,
         shown=None if asked is None or bound is None else percent(bound),
         scope=", ".join(f"{k}: {v}" for k, v in known.items()),

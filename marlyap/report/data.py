@@ -37,11 +37,22 @@ class Within(Share):
     radius: Number = None  # in the unit of the game's distance
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Along:
+    """The team's cost of a step along an episode: its mean over starts, and where 90 % lie."""
+
+    times: np.ndarray  # [time], s
+    mean: np.ndarray  # [time]
+    low: np.ndarray  # [time], the quantile .05 over the starts
+    high: np.ndarray  # [time], the quantile .95
+
+
 @dataclass(frozen=True, kw_only=True)
 class Figures(Share):
     """What an evaluation found, of one policy or over the training seeds of a group."""
 
     label: str = ""
+    game: str = ""  # that it was measured on, in words; charts are drawn for each
     unit: str = ""  # of the radius, the radii and the final distance
     confidence: Number = None
     radius: Number = None  # of success
@@ -59,6 +70,8 @@ class Figures(Share):
     return_mean: Number = None  # of an episode
     cost_mean: Number = None  # of the team, mean over steps and episodes
     rests: str = ""  # what a team does once it has arrived, in words
+    finals: Sequence[Number] = ()  # the final distance of every episode
+    along: Along | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,17 +164,20 @@ class Film:
     frames: Frames
     label: str = "episode"  # "best", "median", "worst", ...
     start: str = ""  # number of the start among those evaluated
-    run: str = ""
+    run: str = ""  # who drives: a run, or the name of a controller
+    shot: str = ""  # equal for films of one start of one game: they can be seen side by side
+    title: str = ""  # of such films, where it is not the label
     distance: np.ndarray | None = None  # [time], of the agent farthest from where it has to be
     edge: Number = None  # the distance up to which an agent counts as arrived
     unit: str = ""  # of distance and edge
     level: np.ndarray | None = None  # [time]: a Lyapunov function, or the cost
     level_name: str = ""
+    cost: np.ndarray | None = None  # [time], where the level is another
     rises: bool = False  # whether the level should fall, so that its rises are marked
     success: bool | None = None
 
     def __post_init__(self):
-        for name in ("distance", "level"):
+        for name in ("distance", "level", "cost"):
             if (value := getattr(self, name)) is not None:
                 array, time = np.asarray(value, float), len(self.frames.times)
                 if array.shape != (time,):
@@ -194,6 +210,7 @@ class Claim:
     bound: Number | str = None
     confidence: Number | str = None
     scope: str | None = None  # start distribution, horizon, disturbance
+    shot: str = ""  # of the film of its worst case
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -225,10 +242,10 @@ class Training:
 
 @dataclass(frozen=True)
 class Difference:
-    """What tells one configuration from the others."""
+    """A field in which configurations differ, and its value in each."""
 
-    name: str
-    fields: str
+    field: str
+    values: Sequence[str]  # one for each group of the page
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,10 +1,11 @@
-"""An episode as a film. `film` alone asks a game what a state is; the rest draws what it says."""
+"""An episode as a film, and costs along episodes. `film` alone asks a game what a state is."""
 
 from typing import Any, cast
 
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from marlyap.certificates.certificate import start_of
 from marlyap.certificates.lyapunov import CostSum
@@ -16,19 +17,11 @@ from marlyap.runs.run import Run
 from marlyap.seeds import Purpose, stream
 from marlyap.simulation.evaluation import episode
 from marlyap.simulation.rollout import Controller, rollout, until
-from marlyap.types import Key, State, Trajectory
+from marlyap.types import Key, Keys, State, Trajectory
 
 
 METRES = "m"  # the unit of every scene
-
-
-def films(run: Run, measured: groups.Measured, label: str = "") -> list[Film]:
-    """The best, the median and the worst of the evaluation's episodes, by final distance."""
-    final = measured.evaluation.final
-    order = np.argsort(np.where(np.isfinite(final), final, np.inf))
-    picks = {"best": order[0], "median": order[len(order) // 2], "worst": order[-1]}
-    episodes, game, starts = len(order), measured.game, measured.starts
-    return [one(run, int(k), starts, name, episodes, game, label) for name, k in picks.items()]
+MOST_CURVES = 100  # episodes whose costs are drawn
 
 
 def one(
@@ -127,6 +120,7 @@ def film(
         distance=np.asarray(jax.vmap(game.distance)(state)).max(axis=1),
         edge=game.edge,
         unit=game.unit,
+        cost=None if lyapunov is None else cost,
         level=cost if lyapunov is None else np.asarray(lyapunov),
         level_name="cost" if lyapunov is None else function,
         rises=lyapunov is not None,
@@ -144,6 +138,19 @@ def _headings(frame: np.ndarray) -> np.ndarray:
     ahead = frame[..., 0, :2]
     size = np.linalg.norm(ahead, axis=-1, keepdims=True)
     return np.divide(ahead, size, out=np.full_like(ahead, np.nan), where=size > 1e-9)
+
+
+def costs(
+    game: AbstractGame, controller: Controller, seed: int, episodes: int
+) -> Float[np.ndarray, "episode time"]:
+    """What each step of the first evaluation episodes costs the team."""
+    keys = jax.random.split(stream(seed, "evaluate"), episodes)[:MOST_CURVES]
+    return np.asarray(_costs(game, controller, keys))
+
+
+@eqx.filter_jit
+def _costs(game: AbstractGame, controller: Controller, keys: Keys) -> jax.Array:
+    return jax.vmap(lambda k: episode(game, controller, k).cost.mean(axis=1))(keys)
 
 
 @eqx.filter_jit

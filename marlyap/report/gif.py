@@ -22,7 +22,7 @@ from marlyap.report.scene import (
     RULE,
     SOFT,
     Scene,
-    framed,
+    aligned,
     scenes,
 )
 from marlyap.storage.store import write_bytes_atomic
@@ -38,7 +38,7 @@ def film_gif(film: Film, path: str | Path, fps: float | int = 10) -> None:
 
     Raises UserError if the file cannot be written.
     """
-    _write(scenes([film]), path, fps)
+    films_gif([film], path, fps)
 
 
 def film_pair_gif(left: Film, right: Film, path: str | Path, fps: float | int = 10) -> None:
@@ -46,23 +46,21 @@ def film_pair_gif(left: Film, right: Film, path: str | Path, fps: float | int = 
 
     Raises UserError if the file cannot be written.
     """
-    pair = scenes([left, right])
-    windows = [scene.panels[0].window for scene in pair if len(scene.panels) == 1]
-    if len(windows) == 2 and not any(scene.panels[0].lanes for scene in pair):
-        low, high = np.min(windows, axis=0), np.max(windows, axis=0)
-        x, y = (low[0] + high[1]) / 2, (low[2] + high[3]) / 2
-        side = max(high[1] - low[0], high[3] - low[2])
-        pair = [framed(scene, float(side), (float(x), float(y))) for scene in pair]
-    _write(pair, path, fps)
+    films_gif([left, right], path, fps)
 
 
-def _write(shown: Sequence[Scene], path: str | Path, fps: float | int) -> None:
-    figure = plot.figure(
-        SIDE * len(shown), SIDE * max(_height(scene) for scene in shown), DPI, layout="constrained"
-    )
-    spaces = figure.subfigures(1, len(shown), squeeze=False).ravel()
-    panes = [_Pane(space, scene) for space, scene in zip(spaces, shown, strict=True)]
-    frames = _frames(figure, panes, max(len(scene.times) for scene in shown))
+def films_gif(
+    films: Sequence[Film],
+    path: str | Path,
+    fps: float | int = 10,
+    dpi: int = DPI,
+    most: int = MOST_FRAMES,
+) -> None:
+    """Several episodes side by side, at one scale and at one time, in at most so many frames.
+
+    Raises UserError if the file cannot be written.
+    """
+    frames = pictures(aligned(scenes(films)), dpi, most)
     palette = Image.new("P", (1, 1))
     palette.putpalette([channel for colour in _inks() for channel in colour])
     small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
@@ -70,6 +68,15 @@ def _write(shown: Sequence[Scene], path: str | Path, fps: float | int) -> None:
     options = {"duration": pause, "loop": 0, "disposal": 1, "append_images": small[1:]}
     save = lambda file: small[0].save(file, format="GIF", save_all=True, **options)
     write_bytes_atomic(Path(path), save)
+
+
+def pictures(shown: Sequence[Scene], dpi: int = DPI, most: int = MOST_FRAMES) -> list[Image.Image]:
+    """Every frame of several scenes side by side."""
+    height = SIDE * max(_height(scene) for scene in shown)
+    figure = plot.figure(SIDE * len(shown), height, dpi, layout="constrained")
+    spaces = figure.subfigures(1, len(shown), squeeze=False).ravel()
+    panes = [_Pane(space, scene) for space, scene in zip(spaces, shown, strict=True)]
+    return _frames(figure, panes, _times(max(len(scene.times) for scene in shown), most))
 
 
 def _strips(scene: Scene) -> int:
@@ -125,11 +132,11 @@ def _once(axes, artist) -> None:
     artist.remove()
 
 
-def _frames(figure: Figure, panes: Sequence[_Pane], length: int) -> list[Image.Image]:
+def _frames(figure: Figure, panes: Sequence[_Pane], times: Sequence[int]) -> list[Image.Image]:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     still, made = canvas.copy_from_bbox(figure.bbox), []
-    for k in _times(length):
+    for k in times:
         canvas.restore_region(still)
         for pane in panes:
             pane.draw(k)
@@ -137,9 +144,9 @@ def _frames(figure: Figure, panes: Sequence[_Pane], length: int) -> list[Image.I
     return made
 
 
-def _times(length: int) -> list[int]:
+def _times(length: int, most: int) -> list[int]:
     """The frames to draw: all of a short film, some of a long one, the last always."""
-    stride = math.ceil(length / MOST_FRAMES)
+    stride = math.ceil(length / most)
     return [*range(0, length - 1, stride), length - 1]
 
 

@@ -1,14 +1,14 @@
 """One self-contained HTML page that says how good a team is and shows it moving.
 
 `html` is a pure function from data to text: no JAX, no network, no files but the package's own
-`page.html`, `style.css` and `player.js`. Every text is escaped, and the page's security policy
-allows only the package's own script.
+`page.html`, `style.css`, `player.js` and `charts.js`, and Bokeh's library. Every text is escaped,
+and the page's security policy allows these scripts alone.
 """
 
 import base64
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -16,36 +16,65 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from marlyap.report import charts, plot, words
-from marlyap.report.data import Claim, Figures, Group, Page, Slice
-from marlyap.report.scene import PALETTE, Scene, played, scenes
+from marlyap.report import charts, interactive, plot, words
+from marlyap.report.data import Claim, Figures, Group, Page
+from marlyap.report.scene import PALETTE, Scene, Shot, played, shots
 
 
 MOST_SHOWN = 6  # episodes whose paths are drawn
-SQUARE, WIDE = (3.6, 3.6), (3.9, 2.6)  # inches
+SQUARE = (3.6, 3.6)  # inches
 
 
 def html(page: Page) -> str:
     """The whole report as the text of one HTML file."""
-    shown, script = scenes(page.films), _own("player.js")
+    shown = shots(page.films)
+    drawn = charts.charts(page.runs, page.groups)
+    scripts = {"player": _own("player.js")}
+    lively = interactive.embedded(drawn, page.slices) if drawn or page.slices else None
+    if lively is not None:
+        scripts |= {"bokeh": Markup(interactive.library()), "charts": _own("charts.js")}
     radii = sorted({radius for run in page.runs for radius, *_ in charts.within(run)})
+    paths = [scene for shot in shown for scene in shot.scenes[:1]]
     return page_of(
         "page.html",
         page=page,
-        policy=_policy(script),
-        script=script,
-        scenes=shown,
-        films=_json([played(scene) for scene in shown]),
-        starts=[(scene, _paths(scene, f"s{k}-")) for k, scene in enumerate(shown[:MOST_SHOWN])],
-        charts=[(c.caption, _chart(c, f"c{k}-")) for k, c in enumerate(charts.charts(page.runs))],
-        names=charts.legend(page.runs),
-        slices=[(part, _slice(part, f"v{k}-")) for k, part in enumerate(page.slices)],
+        policy=_policy(scripts.values()),
+        scripts=scripts,
+        shots=shown,
+        scenes=[scene for shot in shown for scene in shot.scenes],
+        films=_json([_told(shot) for shot in shown]),
+        shot_of=_numbers(page),
+        starts=[(scene, _paths(scene, f"s{k}-")) for k, scene in enumerate(paths[:MOST_SHOWN])],
+        charts=drawn,
+        lively=None if lively is None else _json([lively.document, lively.items]),
+        games=list(dict.fromkeys(chart.game for chart in drawn)),
+        teams=_teams(page),
         tints=[k % len(PALETTE) for k in charts.colours(page.runs)],
-        colours=len(PALETTE),
         config=list(words.flatten(page.config)),
         nearest=radii[:1],
         unit=_unit(page.runs),
     )
+
+
+def _told(shot: Shot) -> dict[str, Any]:
+    return {"label": shot.label, "films": [played(scene) for scene in shot.scenes]}
+
+
+def _numbers(page: Page) -> dict[str, int]:
+    """The number of each shot that has a name."""
+    names = dict.fromkeys(film.shot or f"alone {k}" for k, film in enumerate(page.films))
+    return {name: k for k, name in enumerate(names)}
+
+
+def _teams(page: Page) -> list[dict[str, Any]]:
+    """Each group with its runs, as the switches of the charts show them."""
+    tints, runs = charts.colours(page.runs), page.runs
+    made = []
+    for k, group in enumerate(charts.teams(runs)):
+        own = [n for n, run in enumerate(runs) if run.group == group]
+        members = [(n, charts.name(runs[n]), tints[n] % len(PALETTE)) for n in own]
+        made.append({"number": k, "name": group or "all runs", "members": members})
+    return made
 
 
 def page_of(template: str, **said: Any) -> str:
@@ -81,11 +110,15 @@ def _own(name: str) -> Markup:
     return Markup(files("marlyap.report").joinpath(name).read_text(encoding="utf-8"))
 
 
-def _policy(script: str) -> str:
-    """A content security policy: nothing from anywhere, and no script but this one."""
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    nothing = "default-src 'none'; base-uri 'none'; form-action 'none'"
-    return f"{nothing}; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
+def _policy(scripts: Iterable[str]) -> str:
+    """A content security policy: nothing from anywhere, and no script but these.
+
+    The library of the charts draws its own small icons, as data.
+    """
+    digest = lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    allowed = " ".join(f"'sha256-{digest(script)}'" for script in scripts)
+    nothing = "default-src 'none'; base-uri 'none'; form-action 'none'; img-src data:"
+    return f"{nothing}; style-src 'unsafe-inline'; script-src {allowed}"
 
 
 def _json(value: Any) -> Markup:
@@ -108,18 +141,6 @@ def _paths(scene: Scene, prefix: str) -> Markup:
     figure = plot.figure(SQUARE[0], height)
     plot.whole(figure, scene)
     return Markup(plot.svg(figure, f"trajectories, {scene.label}", prefix))
-
-
-def _chart(chart: charts.Chart, prefix: str) -> Markup:
-    figure = plot.figure(*WIDE)
-    plot.chart(figure.subplots(), chart)
-    return Markup(plot.svg(figure, chart.caption, prefix))
-
-
-def _slice(part: Slice, prefix: str) -> Markup:
-    figure = plot.figure(*SQUARE)
-    plot.level_sets(figure.subplots(), part)
-    return Markup(plot.svg(figure, f"level sets of V, {part.label}", prefix))
 
 
 def _gauge(figures: Figures) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Matplotlib: scenes, charts and slices, drawn once for SVG, PNG and GIF.
+"""Matplotlib: scenes and charts, drawn once for SVG, PNG and GIF.
 
 One colour per body, leaders filled and ringed, followers hollow, the goal's ring to scale, a
 Lyapunov function in vermilion where it rises. In an SVG every colour is a variable of the page's
@@ -25,7 +25,6 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.path import Path
 
 from marlyap.report.charts import Chart
-from marlyap.report.data import Slice
 from marlyap.report.scene import (
     ALARM,
     FAINT,
@@ -48,7 +47,6 @@ from marlyap.report.words import short
 VARIABLES = {colour: f"var(--c{k})" for k, colour in enumerate(PALETTE)}
 VARIABLES |= {ALARM: "var(--alarm)", PAPER: "var(--raised)", INK: "var(--ink)"}
 VARIABLES |= {SOFT: "var(--soft)", RULE: "var(--rule)", FAINT: "var(--faint)"}
-NOTE = "note: "  # begins the id of what has a note in the page
 HREF, SVG = "{http://www.w3.org/1999/xlink}href", "{http://www.w3.org/2000/svg}"
 NUMBERS, COLOURS = re.compile(r"-?\d+\.\d+(?:e-?\d+)?"), re.compile(r"#[0-9a-f]{6}\b")
 PLAIN = ("font-family", "stroke-linejoin", "stroke-linecap", "stroke-dashoffset")  # the page's own
@@ -223,7 +221,7 @@ def until(scene: Scene, strip: Strip, k: int, alpha: float = 1.0) -> Iterator[Ar
         yield LineCollection(pieces, colors=ALARM, linewidths=2.4, alpha=alpha)
 
 
-# ---- charts and slices ----
+# ---- charts ----
 
 
 def chart(axes: Axes, shown: Chart) -> None:
@@ -241,8 +239,6 @@ def chart(axes: Axes, shown: Chart) -> None:
                 line.x, line.low, line.high, color=line.colour, alpha=0.12, linewidth=0
             )
         axes.plot(line.x, line.y, color=line.colour, linewidth=2.4 if line.thick else 1.2)
-        for x, y, note in zip(line.x, line.y, line.notes, strict=bool(line.notes)):
-            axes.plot([x], [y], "o", color=line.colour, markersize=4, gid=NOTE + note)
     axes.set_xlabel(shown.x_label, color=SOFT, fontsize=8)
     quiet(axes)
 
@@ -259,31 +255,6 @@ def legend(shown: Figure, names: Sequence[str]) -> None:
         fontsize=8,
         labelcolor=SOFT,
     )
-
-
-def level_sets(axes: Axes, part: Slice) -> None:
-    """Level sets of V around a goal, and in dashes the one that is certified."""
-    reach, grid = part.reach, np.linspace(-part.reach, part.reach, len(part.values))
-    marks = ticks(-reach, reach)
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=marks, yticks=marks)
-    values = np.ma.masked_invalid(part.values)
-    levels = np.unique(np.quantile(values.compressed(), [0.03, 0.1, 0.25, 0.5, 0.75, 0.95]))
-    levels = levels[levels > values.min()]  # V is 0 in a whole ball: no line, but a jagged one
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(lambda value, _: short(value))
-    lines = axes.contour(grid, grid, values, levels, colors=PALETTE[0], linewidths=1, alpha=0.8)
-    axes.clabel(lines, fmt=lambda level: f"{level:.3g}", fontsize=7, colors=SOFT)
-    if part.level is not None:
-        axes.contour(grid, grid, values, [part.level], colors=INK, linewidths=1.6, linestyles="--")
-    axes.add_patch(
-        Circle(
-            (0, 0), part.radius, facecolor=to_rgba(INK, 0.05), edgecolor=INK, linestyle=(0, (3, 2))
-        )
-    )
-    unit = f" ({part.unit})" if part.unit else ""
-    axes.set_xlabel(f"x{unit}", color=SOFT, fontsize=8)
-    axes.set_ylabel(f"y{unit}", color=SOFT, fontsize=8)
-    quiet(axes)
 
 
 def quiet(axes: Axes) -> None:
@@ -324,12 +295,9 @@ def _element(node: ElementTree.Element, names: Mapping[str, str]) -> str:
     tag = node.tag.removeprefix(SVG)
     inner = escape((node.text or "").strip(), quote=False)
     inner += "".join(_element(child, names) for child in node)
-    name = node.attrib.get("id", "")
     if tag in ("metadata", "style") or (tag in ("g", "defs") and not inner):
         return ""
-    if tag == "g" and name.startswith(NOTE):
-        inner = f"<title>{escape(name.removeprefix(NOTE))}</title>{inner}"
-    elif tag == "g" and not set(node.attrib) - {"id"}:
+    if tag == "g" and not set(node.attrib) - {"id"}:
         return inner
     written = "".join(_attribute(key, value, names) for key, value in node.attrib.items())
     return f"<{tag}{written}>{inner}</{tag}>" if inner else f"<{tag}{written}/>"

@@ -44,7 +44,8 @@ def learning_curves_png(runs: Sequence[Trained], path: str | Path) -> None:
 
     Raises UserError if the file cannot be written.
     """
-    both = charts.learning(runs, "success"), charts.learning(runs, "total")
+    told = charts.Told(runs, ())
+    both = charts.learning(told, "success"), charts.learning(told, "total")
     known = [chart for chart in both if chart is not None]
     figure = plot.figure(8.4, 3.4)
     for axes, chart in zip(figure.subplots(1, 2), known, strict=False):

@@ -23,7 +23,9 @@ PAPER, INK, SOFT, RULE, FAINT = "#ffffff", "#1c1d20", "#5e6169", "#dddcd6", "#ec
 
 TRAIL = 1.5  # s, for which a body's trail is drawn strongly
 RISE = 1e-3  # of the largest value: a smaller rise is not marked
+FLAT = 0.4  # least height of a view from above where its width is 1, and the scene is a row
 MOST_STRIPS = 8
+MOST_PLAYED = 300  # times of a film in the page; of a longer one every so many are left out
 
 
 def ink(number: int) -> str:
@@ -107,6 +109,20 @@ class Scene:
         return " · ".join(parts)
 
     @property
+    def who(self) -> str:
+        """Who drives."""
+        return self.film.run or self.film.label
+
+    @property
+    def ended(self) -> str:
+        """How it ended, in a few words."""
+        film, end = self.film, {None: "", True: "success", False: "failure"}[self.film.success]
+        far = ""
+        if film.distance is not None:
+            far = f"final distance {decimal(film.distance[-1], 3, film.unit)}"
+        return " · ".join(part for part in (end, far) if part)
+
+    @property
     def outcome(self) -> str:
         """Whose episode it is, where that is said, and how it went."""
         end = {None: "", True: "success", False: "failure"}[self.film.success]
@@ -157,11 +173,68 @@ def scenes(films: Sequence[Film]) -> list[Scene]:
     return [framed(scene, max(sides)) for scene in made]
 
 
-def framed(scene: Scene, side: float, centre: tuple[float, float] | None = None) -> Scene:
-    """A scene in the plane, shown in a square of this side."""
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """Films of one start, which can be seen side by side."""
+
+    label: str
+    scenes: tuple[Scene, ...]
+
+    @property
+    def told(self) -> str:
+        """The start, and how the first of them ended."""
+        first = self.scenes[0]
+        start = f"start {first.film.start}" if first.film.start else ""
+        many = f"{len(self.scenes)} controllers" if len(self.scenes) > 1 else ""
+        return " · ".join(part for part in (start, many or first.film.run, first.ended) if part)
+
+
+def shots(films: Sequence[Film]) -> list[Shot]:
+    """Films by their start, those of one start drawn to one scale."""
+    groups: dict[str, list[Scene]] = {}
+    for k, scene in enumerate(scenes(films)):
+        groups.setdefault(scene.film.shot or f"alone {k}", []).append(scene)
+    return [
+        Shot(those[0].film.title or those[0].label, aligned(those)) for those in groups.values()
+    ]
+
+
+def aligned(those: Sequence[Scene]) -> tuple[Scene, ...]:
+    """Scenes with the same windows, and their strips at one scale, those that all have first."""
+    if len({len(scene.panels) for scene in those}) > 1:
+        return tuple(those)
+    windows = [_around(same) for same in zip(*(scene.panels for scene in those), strict=True)]
+    spans: dict[str, tuple[float, float]] = {}
+    for strip in (strip for scene in those for strip in scene.strips):
+        low, high = spans.get(strip.name, strip.span)
+        spans[strip.name] = (min(low, strip.span[0]), max(high, strip.span[1]))
+    shared = set.intersection(*({strip.name for strip in scene.strips} for scene in those))
+    in_order = lambda scene: sorted(scene.strips, key=lambda strip: strip.name not in shared)
+    return tuple(
+        replace(
+            scene,
+            panels=tuple(replace(p, window=w) for p, w in zip(scene.panels, windows, strict=True)),
+            strips=tuple(replace(strip, span=spans[strip.name]) for strip in in_order(scene)),
+        )
+        for scene in those
+    )
+
+
+def _around(panels: Sequence[Panel]) -> tuple[float, float, float, float]:
+    """A window that shows all of several; square where each of them is."""
+    low, high = (pick([panel.window for panel in panels], axis=0) for pick in (np.min, np.max))
+    left, right, bottom, top = (float(v) for v in (low[0], high[1], low[2], high[3]))
+    if any(panel.lanes or abs(panel.height - 1) > 1e-6 for panel in panels):
+        return left, right, bottom, top
+    half, x, y = max(right - left, top - bottom) / 2, (left + right) / 2, (bottom + top) / 2
+    return x - half, x + half, y - half, y + half
+
+
+def framed(scene: Scene, side: float) -> Scene:
+    """A scene in the plane, shown as wide as this side."""
     left, right, bottom, top = scene.panels[0].window
-    x, y = centre or ((left + right) / 2, (bottom + top) / 2)
-    window = x - side / 2, x + side / 2, y - side / 2, y + side / 2
+    x, y, tall = (left + right) / 2, (bottom + top) / 2, side * scene.panels[0].height
+    window = x - side / 2, x + side / 2, y - tall / 2, y + tall / 2
     return replace(scene, panels=(replace(scene.panels[0], window=window),))
 
 
@@ -215,7 +288,8 @@ def _panels(places: np.ndarray, goals: np.ndarray, d: int, frames: Frames) -> tu
         window = x - side / 2, x + side / 2, 0.3 - places.shape[1], 0.7
         return (Panel((0, 1), (name("x"), "body"), window, lanes=True),)
     side = 1.12 * max(float(extent[:2].max()), 6 * radius, 1e-3)
-    half = [side / 2, side / 2, max(float(extent[-1]) / 2 + 0.07 * side, side / 8)]
+    tall = side if d > 2 or extent[1] > FLAT * extent[0] else FLAT * side
+    half = [side / 2, tall / 2, max(float(extent[-1]) / 2 + 0.07 * side, side / 8)]
     view = lambda a, b: (
         *(float(middle[a] - half[a]), float(middle[a] + half[a])),
         *(float(middle[b] - half[b]), float(middle[b] + half[b])),
@@ -233,6 +307,8 @@ def _strips(film: Film) -> tuple[Strip, ...]:
         name = f"largest distance ({film.unit})" if film.unit else "largest distance"
         most = _span(np.append(film.distance, film.edge or 0.0))
         made.append(Strip(name, film.distance[None], most, mark=film.edge))
+    if film.cost is not None:
+        made.append(Strip("cost", film.cost[None], _span(film.cost)))
     for name, values in frames.signals.items():
         made.append(Strip(name, values.T, _span(values, zero=False), agents=True))
     return tuple(made[:MOST_STRIPS])
@@ -275,28 +351,33 @@ def _over(a: float, b: float) -> float:
 
 def played(scene: Scene) -> dict[str, Any]:
     """What the player of the page reads: numbers, rounded, with None for what is not finite."""
+    stride = -(-len(scene.times) // MOST_PLAYED)
     moving = not np.array_equal(scene.goals, np.broadcast_to(scene.goals[:1], scene.goals.shape))
+    links = scene.film.frames.links
     return {
         "label": scene.label,
-        "dt": scene.dt,
-        "steps": len(scene.times),
+        "who": scene.who,
+        "ended": scene.ended,
+        "dt": scene.dt * stride,
+        "steps": len(scene.times[::stride]),
         "radius": scene.edge,
         "unit": scene.film.frames.unit,
-        "goals": plain(scene.goals if moving else scene.goals[:1]),
-        "positions": plain(scene.places),
-        "headings": None if scene.angles is None else plain(scene.angles, 3),
+        "goals": plain(scene.goals[::stride] if moving else scene.goals[:1]),
+        "positions": plain(scene.places[::stride]),
+        "headings": None if scene.angles is None else plain(scene.angles[::stride], 3),
         "leaders": scene.leaders,
         "rods": scene.film.frames.rods,
         "tints": scene.tints,
-        "edges": scene.film.frames.links or ((),),
+        "edges": (links[::stride] if len(links) > 1 else links) or ((),),
         "panels": [vars(panel) for panel in scene.panels],
-        "strips": [vars(strip) | {"lines": _rounded(strip)} for strip in scene.strips],
+        "strips": [vars(strip) | {"lines": _rounded(strip, stride)} for strip in scene.strips],
     }
 
 
-def _rounded(strip: Strip) -> list[list[Number]]:
+def _rounded(strip: Strip, stride: int) -> list[list[Number]]:
     """Four digits: of each value where the axis begins at 0, else of the axis."""
     low, high = strip.span
+    lines = strip.lines[:, ::stride]
     if not low:
-        return plain(strip.lines, significant=True)
-    return plain(strip.lines, 4 - math.floor(math.log10(high - low)))
+        return plain(lines, significant=True)
+    return plain(lines, 4 - math.floor(math.log10(high - low)))

@@ -15,6 +15,7 @@ import types
 import typing
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -186,7 +187,8 @@ def override_all(parts: Mapping[str, Any], texts: Mapping[str, str]) -> dict[str
 
 def fields(obj: Any) -> dict[str, Any]:
     """The configuration of an object: its fields by name."""
-    return {f.name: getattr(obj, f.name) for f in dataclasses.fields(obj) if f.init}
+    have = vars(obj)  # at once: a module of equinox takes long to find an attribute
+    return {f.name: have[f.name] for f in dataclasses.fields(obj) if f.init}
 
 
 def record(obj: Any) -> Any:
@@ -440,6 +442,7 @@ def _expected(hint: Any) -> str:
     return " or ".join(names)
 
 
+@cache
 def _hints(cls: type) -> dict[str, Any]:
     hints = typing.get_type_hints(cls)
     return {f.name: hints[f.name] for f in dataclasses.fields(cls) if f.init}

@@ -1,8 +1,8 @@
 """The host loop over compiled iterations: progress, log, checkpoints, stopping."""
 
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -22,11 +22,13 @@ from marlyap.learning.algorithms import ALGORITHMS
 from marlyap.learning.diagnose import diagnose
 from marlyap.learning.health import Health, TaskFault
 from marlyap.learning.schedule import Schedule
+from marlyap.learning.traced import with_arrays
 from marlyap.learning.trainer import Carry, Trainer, schedule_for
 from marlyap.nets.nets import LyapunovNet, NormNet
 from marlyap.runs import config, events
 from marlyap.runs.progress import show
 from marlyap.runs.run import Run, begin, sound
+from marlyap.runs.sinks import Sinks
 from marlyap.simulation.rollout import Decentralised, Policy
 from marlyap.storage import store
 from marlyap.tasks import TASKS
@@ -41,24 +43,31 @@ class Diverged(UserError):
 
 
 def fit(
-    runs: list[Run], stop: Callable[[], bool] = lambda: False, attempts: int = 1
+    runs: list[Run],
+    stop: Callable[[], bool] = lambda: False,
+    attempts: int = 1,
+    log: Sequence[str] = (),
 ) -> Iterator[events.Event]:
     """Train `runs` to the end, or until `stop()`; yields a Progress for each run and iteration.
 
-    Several runs must differ in their seed alone; they advance together under `vmap`. Everything
+    Several runs must differ in their seeds, and in numbers that their programs are given
+    (`learning.traced`), alone; they advance together under `vmap`. Everything
     is saved at the end and when stopped, so that calling this again resumes bit for bit. A run in
     which a number stops being finite is stopped, the others continue; with more `attempts` it is
-    taken up again, from its last checkpoint and with other random numbers.
+    taken up again, from its last checkpoint and with other random numbers. `log` names trackers
+    that are told the log as well.
     Raises Diverged (a UserError) if this was so in every run to the last.
     """
     with ExitStack() as held:
         for run in runs:
             held.enter_context(store.lock(run.directory))
             store.sweep(run.directory)
-        yield from _fit(runs, stop, attempts)
+        yield from _fit(runs, stop, attempts, log)
 
 
-def _fit(runs: list[Run], stop: Callable[[], bool], attempts: int) -> Iterator[events.Event]:
+def _fit(
+    runs: list[Run], stop: Callable[[], bool], attempts: int, log: Sequence[str]
+) -> Iterator[events.Event]:
     """Train the runs that stand at the same iteration together, one such group after the other.
 
     A damaged checkpoint or a fault may have thrown one run further back than the others.
@@ -71,7 +80,10 @@ def _fit(runs: list[Run], stop: Callable[[], bool], attempts: int) -> Iterator[e
             yield from (events.Warned(*one.run.named, w) for w in one.warnings)
         faults = {}
         for _, group in groupby(sorted(loaded, key=_iteration), key=_iteration):
-            faults |= yield from _together([one.reseeded(attempt) for one in group], stop)
+            going = [one.reseeded(attempt) for one in group]
+            with ExitStack() as told:
+                sinks = [told.enter_context(closing(one.run.sinks(log))) for one in going]
+                faults |= yield from _together(going, sinks, stop)
         if not faults or stop():
             break
         if attempt + 1 < attempts:
@@ -106,30 +118,31 @@ def _iteration(loaded: _Loaded) -> int:
 
 
 def _together(
-    loaded: list[_Loaded], stop: Callable[[], bool]
+    loaded: list[_Loaded], sinks: list[Sinks], stop: Callable[[], bool]
 ) -> Generator[events.Event, None, dict[int, Diverged]]:
     """Train runs that stand at the same iteration; returns why, for each seed that was stopped."""
     faults: dict[int, Diverged] = {}
     runs, trainer = [one.run for one in loaded], loaded[0].run.trainer
+    given = stacked([run.trainer for run in runs])
     first = carry = _stack([one.carry for one in loaded])
     before, clock = max(one.seconds for one in loaded), time.monotonic()
     saved, alive = _Saved(clock), [True] * len(runs)
 
-    for done, carry, told in advance(trainer, first, stop):
+    for done, carry, told in advance(given, first, stop):
         seconds = before + time.monotonic() - clock
         for i, run in enumerate(runs):
             line = _line(trainer, run.seed, done, seconds, told.log, i)
             fault = _fault(line, told.health_of(i), trainer.game.agents)
             if fault and alive[i]:
                 alive[i] = False
-                where = None if fault.by_task else diagnose(trainer, run.load()[0], done)
+                where = None if fault.by_task else diagnose(run.trainer, run.load()[0], done)
                 says = f"{fault.says(where)} in {run.directory}."
                 faults[run.seed] = Diverged(says)
                 yield events.Diverged(*run.named, done, fault.name, says)
                 if not any(alive):
                     return faults
             if alive[i]:
-                run.log(line)
+                sinks[i].line(run.log(line))
                 yield events.Progress(*run.named, line, trainer.iterations)
         if saved.due():
             yield from saved.save(runs, carry, alive, seconds)
@@ -152,12 +165,13 @@ def advance(
 ) -> Iterator[tuple[int, Carry, Told]]:
     """Iterate to the end or until `stop()`; yields (iterations done, carry, what it tells).
 
-    The arrays of `carry` have a leading axis of runs where there are several; those of `Told`
-    always have it. The carry that goes in is used up.
+    The arrays of `carry` have a leading axis of runs where there are several, and so may those of
+    `trainer` (`stacked`); those of `Told` always have it. The carry that goes in is used up.
     """
     done, mesh = int(np.min(carry.iteration)), devices.mesh_for(carry.iteration.size)
     carry = devices.placed(carry, carry.iteration.ndim > 0, mesh)
-    compiled = lambda f: export_cache.compiled(f, trainer, carry, lambda: carry, donate=True)
+    given = with_arrays(trainer)
+    compiled = lambda f: export_cache.compiled(f, given, carry, lambda: carry, donate=True)
     iterate = select = None
     while done < trainer.iterations and not stop():
         done += 1
@@ -200,6 +214,7 @@ class Trained:
         with store.lock(run.directory):
             for line in self.history:
                 run.log(line)
+            run.sinks().close()
             run.save(self.carry, self.history[-1]["seconds"])
         return run
 
@@ -308,27 +323,42 @@ def _row(carry: Carry, i: int) -> Carry:
     return jax.tree.map(lambda x: x[i] if eqx.is_array(x) else x, carry)
 
 
+def stacked(trainers: list[Trainer]) -> Trainer:
+    """One trainer for several runs: the numbers that differ between them have a leading axis.
+
+    Raises UserError if they differ in more than the numbers that a program is given.
+    """
+    given = [with_arrays(trainer) for trainer in trainers]
+    free = [eqx.filter(trainer, eqx.is_array, inverse=True) for trainer in given]
+    if any(other != free[0] for other in free):
+        raise UserError("runs: they differ in more than numbers; train them in processes.")
+    if all(trainer == trainers[0] for trainer in trainers):
+        return given[0]
+    return jax.tree.map(lambda *xs: jnp.stack(xs) if eqx.is_array(xs[0]) else xs[0], *given)
+
+
 def _each(
-    f: Callable[[Carry], tuple[Carry, dict[str, Any]]], carry: Carry
+    f: Callable[[Trainer, Carry], tuple[Carry, dict[str, Any]]], trainer: Trainer, carry: Carry
 ) -> tuple[Carry, dict[str, Any]]:
     """`f` for every run: vmapped only when there are several, since a batch of one costs speed."""
     several = carry.iteration.ndim > 0
-    axis: dict[str, Any] = {"spmd_axis_name": devices.RUNS}
-    each = eqx.filter_vmap(f, **axis) if several else f
-    after, info = each(carry)
+    own = lambda x: 0 if eqx.is_array(x) and x.ndim else None  # a run's own, or that of all
+    axes: dict[str, Any] = {"in_axes": (own, eqx.if_array(0)), "spmd_axis_name": devices.RUNS}
+    each = eqx.filter_vmap(f, **axes) if several else f
+    after, info = each(trainer, carry)
     return devices.kept(after, several), info
 
 
 def _iterate(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
-    def told(carry):
+    def told(trainer, carry):
         after, info = trainer.iterate(carry)
         return after, {"log": info.log, "health": info.health._asdict()}
 
-    return _each(told, carry)
+    return _each(told, trainer, carry)
 
 
 def _select_best(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
-    return _each(trainer.select_best, carry)
+    return _each(lambda trainer, carry: trainer.select_best(carry), trainer, carry)
 
 
 def _line(

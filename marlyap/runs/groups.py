@@ -113,15 +113,26 @@ def named(configurations: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str]:
 
 def differing(records: Sequence[Mapping[str, Any]]) -> list[str]:
     """For each of several records, the fields in which they differ, as one would type them."""
-    flats = [dict(_flat(r)) for r in records]
-    names = list(dict.fromkeys(name for flat in flats for name in flat))
-    telling = [
-        name
-        for name in names
-        if len({json.dumps(flat[name], default=str) for flat in flats if name in flat}) > 1
-    ]
+    flats, telling = _telling(records)
     said = lambda flat: [f"{_field(n)}={_shown(flat[n])}" for n in telling if n in flat]
     return [", ".join(said(flat)) for flat in flats]
+
+
+def side_by_side(records: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
+    """The fields in which records differ by dotted name, with the value of each; "" without."""
+    flats = [dict(_flat(r)) for r in records]
+    names = dict.fromkeys(name for flat in flats for name in flat)
+    shown = lambda name: [_shown(flat[name]) if name in flat else "" for flat in flats]
+    rows = [(name, shown(name)) for name in names]
+    return [(name, values) for name, values in rows if len(set(values)) > 1]
+
+
+def _telling(records: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], list[str]]:
+    """The records flat, and the fields that tell those apart that have them."""
+    flats = [dict(_flat(r)) for r in records]
+    names = dict.fromkeys(name for flat in flats for name in flat)
+    values = lambda name: {json.dumps(f[name], default=str) for f in flats if name in f}
+    return flats, [name for name in names if len(values(name)) > 1]
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

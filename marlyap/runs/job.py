@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from marlyap.errors import UserError, check_range
@@ -24,8 +26,14 @@ class Launch:
     attempts: int = 3  # with rollback, how often a run is tried in all
     task: str | None = None  # path/to/file.py:Name where the task is code of the user's own, and
     algorithm: str | None = None  # likewise; None: where the run's own classes were defined
+    log: Sequence[str] = ()  # trackers that are told as well: wandb, mlflow, trackio
 
     def __post_init__(self):
+        object.__setattr__(self, "log", tuple(self.log))  # JSON has lists
+        if self.log:
+            from marlyap.runs.sinks import check
+
+            check(self.log)
         for field, choices in CHOICES.items():
             value = getattr(self, field)
             if value not in choices:
@@ -57,3 +65,17 @@ class Job:
         """What `to_json` wrote."""
         data = json.loads(text)
         return cls(data["run"], data["core"], Launch(**data["how"]))
+
+
+def seeds(words: Iterable[str]) -> list[int]:
+    """The seeds asked for: whole numbers, each once."""
+    each = [w for word in words for w in word.split(",")]
+    for word in each:
+        if not re.fullmatch(r"[+-]?\d+", word.strip()):
+            raise UserError(f"seeds: '{word}' is not a whole number.")
+    numbers = [int(w) for w in each]
+    if len(set(numbers)) != len(numbers):
+        raise UserError(f"seeds: {' '.join(each)} names a seed twice.")
+    if not all(0 <= n < 2**31 for n in numbers):
+        raise UserError(f"seeds: {' '.join(each)} must lie between 0 and 2147483647.")
+    return numbers

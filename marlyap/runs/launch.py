@@ -16,6 +16,7 @@ import jax
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
 from marlyap.learning.algorithm import AbstractAlgorithm
+from marlyap.learning.traced import program
 from marlyap.runs import config, events
 from marlyap.runs.fit import Diverged, fit
 from marlyap.runs.job import Job, Launch
@@ -58,17 +59,20 @@ def launch(
 
 
 def together(runs: list[Run], how: Launch, stop: Callable[[], bool]) -> Iterator[events.Event]:
-    """Runs that differ in their seed alone in one program; one such group after the other.
+    """Runs of one program together; one such group after the other.
+
+    They differ in their seeds, and in numbers that the program is given.
 
     Raises UserError at the end if a number stopped being finite in any of them.
     """
     failed: list[str] = []
     while runs:
-        group = [run for run in runs if run.trainer == runs[0].trainer]
-        runs = [run for run in runs if run.trainer != group[0].trainer]
+        what = program(runs[0].trainer)
+        group = [run for run in runs if program(run.trainer) == what]
+        runs = [run for run in runs if program(run.trainer) != what]
         says: dict[str, str] = {}
         try:
-            for event in fit(group, stop, how.tries):
+            for event in fit(group, stop, how.tries, how.log):
                 if isinstance(event, events.Diverged):
                     says[event.run] = event.says
                 yield event

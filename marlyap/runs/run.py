@@ -2,6 +2,7 @@
 
 run.json        task, algorithm, schedule, seed, versions: enough to repeat it
 log.jsonl       one line an iteration
+log.csv, events.out.tfevents.*   the same for spreadsheets and for TensorBoard; not read back
 checkpoints/    the whole learner, replay memory and random keys included; the last two
 policy/         the best policy so far, and the Lyapunov function: what is evaluated and deployed
 """
@@ -30,9 +31,12 @@ from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.health import Health
 from marlyap.learning.schedule import Schedule
 from marlyap.learning.source import shape
+from marlyap.learning.traced import with_arrays
 from marlyap.learning.trainer import Carry, Trainer
 from marlyap.nets.nets import LyapunovNet, NormNet
 from marlyap.runs import config
+from marlyap.runs.curves import columns, framed
+from marlyap.runs.sinks import About, Sinks
 from marlyap.simulation.rollout import Decentralised, Policy
 from marlyap.storage import store
 
@@ -265,10 +269,29 @@ class Run:
             )
         return Decentralised(policy, there)
 
-    def log(self, line: dict[str, Any]) -> None:
-        """One line an iteration; numbers that are not finite are left out."""
+    def log(self, line: dict[str, Any]) -> dict[str, Any]:
+        """One line an iteration; numbers that are not finite are left out. Returns what is kept."""
         sound = {k: v for k, v in line.items() if not isinstance(v, float) or np.isfinite(v)}
         store.append_line(self.directory / "log.jsonl", json.dumps(sound))
+        return sound
+
+    def sinks(self, names: Iterable[str] = ()) -> Sinks:
+        """Where the log is told as well, with all that it holds: log.csv, TensorBoard, these."""
+        made = {"task": self.game, "algorithm": self.trainer.algorithm}
+        made |= {"schedule": self.trainer.schedule}
+        about = About(
+            self.directory,
+            self.title,
+            {k: config.record(v) for k, v in made.items()} | {"seed": self.seed},
+        )
+        return Sinks(about, self.history(), names)
+
+    def curves(self) -> Any:
+        """The log in columns, one row an iteration; what an iteration has not is NaN.
+
+        A pandas DataFrame where pandas is there, else a dict of NumPy arrays.
+        """
+        return framed(columns(self.history()))
 
     def history(self) -> list[dict[str, Any]]:
         path = self.directory / "log.jsonl"
@@ -326,7 +349,7 @@ def begin(trainer: Trainer, seed: int) -> Carry:
     """
     key = seeds.stream(seed, "train")
     like = lambda: eqx.filter_eval_shape(trainer.begin, key)[0]
-    carry, health = export_cache.compiled(_begin, trainer, key, like)(key)
+    carry, health = export_cache.compiled(_begin, with_arrays(trainer), key, like)(key)
     if fault := Health(**health).by_task(trainer.game.agents):
         when = f"in the warm-up (seed {seed})"
         raise UserError(f"{fault.says(when)} (check-task says more).")

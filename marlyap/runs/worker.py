@@ -25,6 +25,9 @@ from marlyap.runs.job import Job
 from marlyap.runs.stop import Stop
 
 
+GRACE = 2.0  # seconds
+
+
 def main() -> int:
     """Do the job that standard input names; returns the exit code."""
     job = Job.from_json(sys.stdin.readline())
@@ -42,10 +45,14 @@ def main() -> int:
 
 
 def obey(orders: TextIO, stop: Stop) -> None:
-    """Ask `stop` at a line, and at the end of the input."""
+    """Ask `stop` at a line, and at the end of the input.
+
+    The parent is gone then, so this process ends after GRACE seconds, whatever it compiles.
+    """
     for _ in orders:
         stop.ask()
     stop.ask()
+    threading.Timer(GRACE, os._exit, (143,)).start()
 
 
 def work(job: Job, stop: Stop, send: Callable[[events.Event], None]) -> int:

@@ -79,6 +79,13 @@ class Shielded(AbstractWrapper):
             _ = game.displacements
 
     @property
+    def nominal(self):
+        raise UserError(
+            "shield: robots would act without it, for a bundle holds the policy alone; export a run "
+            "that was trained without a shield."
+        )
+
+    @property
     def plan(self) -> Plan:
         return self.shield.plan(plain_game(self.inner))
 

@@ -78,18 +78,31 @@ def write(
     directory: Path, kind: str, arrays: Arrays, meta: Mapping[str, Any], *, replace: bool = False
 ) -> None:
     """Store `arrays` and the JSON object `meta` as `directory`, whole and durable or not at all."""
-    plain = {key: _plain(key, array) for key, array in arrays.items()}
-    table = _table(plain)
-    header, slots = _layout(table)
-    payload = [header, *(_raw(plain[key]) for key in slots)]
+    payload, table = _packed(arrays)
     manifest = _manifest(kind, meta, payload, table)
+    write_folder(directory, {PAYLOAD: payload, MANIFEST: [manifest]}, replace=replace)
+
+
+def write_folder(
+    directory: Path, files: Mapping[str, Iterable[Any]], *, replace: bool = False
+) -> None:
+    """Write these files, each given in chunks of bytes, as `directory`, whole or not at all.
+
+    With `replace` the directory may be there, if it holds no other files. Raises UserError where
+    it is in the way or cannot be written.
+    """
     with _beside(directory) as scratch:
-        _check_free(directory, replace)
+        _check_free(directory, replace, {*files})
         scratch.mkdir()
-        _write_file(scratch / PAYLOAD, payload)
-        _write_file(scratch / MANIFEST, [manifest])
+        for name, chunks in files.items():
+            _write_file(scratch / name, chunks)
         _sync(scratch)
         _install(scratch, directory)
+
+
+def packed(arrays: Arrays) -> bytes:
+    """The arrays as the bytes of one safetensors file."""
+    return b"".join(bytes(memoryview(chunk)) for chunk in _packed(arrays)[0])
 
 
 def read(directory: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -278,6 +291,14 @@ def _plain(key: str, array: Any) -> np.ndarray:
     return np.asarray(array, dtype=array.dtype.newbyteorder("<"), order="C")
 
 
+def _packed(arrays: Arrays) -> tuple[list[Any], dict[str, dict[str, Any]]]:
+    """The payload in chunks, and the table of what is in it."""
+    plain = {key: _plain(key, array) for key, array in arrays.items()}
+    table = _table(plain)
+    header, slots = _layout(table)
+    return [header, *(_raw(plain[key]) for key in slots)], table
+
+
 def _raw(array: np.ndarray) -> np.ndarray:
     return array.reshape(-1).view(np.uint8)
 
@@ -315,7 +336,7 @@ def _manifest(kind: str, meta: Mapping[str, Any], payload: list[Any], table: Tab
     files = {PAYLOAD: {"sha256": _sha256(payload), "bytes": size}}
     body = {"schema": SCHEMA, "kind": kind, "meta": dict(meta), "files": files, "arrays": table}
     try:
-        raw = _sealed(body | {"versions": versions()})
+        raw = sealed(body | {"versions": versions()})
         _parse(raw)
     except (TypeError, ValueError, RecursionError) as error:
         raise UserError(f"meta is not JSON ({error}); use finite numbers, text, lists.") from error
@@ -324,7 +345,7 @@ def _manifest(kind: str, meta: Mapping[str, Any], payload: list[Any], table: Tab
     return raw
 
 
-def _sealed(body: Mapping[str, Any]) -> bytes:
+def sealed(body: Mapping[str, Any]) -> bytes:
     """The one way to write `body`, its own hash included, so that no altered byte passes."""
     seal = _sha256([json.dumps(body).encode()])
     return json.dumps({**body, "sha256": seal}, indent=1).encode() + b"\n"
@@ -381,7 +402,7 @@ def _read_manifest(raw: bytes, path: Path, kind: str) -> dict[str, Any]:
         raise CorruptError(
             f"{path} was written by a newer marlyap (schema {schema}); upgrade yours."
         )
-    if schema != SCHEMA or raw != _sealed({key: found[key] for key in found if key != "sha256"}):
+    if schema != SCHEMA or raw != sealed({key: found[key] for key in found if key != "sha256"}):
         raise CorruptError(f"{path} was altered after it was written; {ANOTHER}.")
     if found.get("kind") != kind:
         raise CorruptError(
@@ -553,12 +574,12 @@ def _sync(directory: Path) -> None:
         os.close(handle)
 
 
-def _check_free(directory: Path, replace: bool) -> None:
+def _check_free(directory: Path, replace: bool, names: set[str]) -> None:
     if not os.path.lexists(directory):
         return
     if not replace:
         raise UserError(f"{directory} already exists; remove it or choose another name.")
-    if directory.is_symlink() or {*os.listdir(directory)} - {PAYLOAD, MANIFEST}:
+    if directory.is_symlink() or {*os.listdir(directory)} - names:
         raise UserError(f"{directory} holds other files; move it away or choose another name.")
 
 

@@ -1,6 +1,7 @@
 """The tasks that can be asked for by name: configured objects, so a name is a preset."""
 
 from marlyap.games.dynamics import LateUnicycle, Unicycle
+from marlyap.games.perturbed import Perturbed
 from marlyap.tasks.cartpoles import CartPoles as CartPoles
 from marlyap.tasks.consensus import Averaging, Consensus as Consensus
 from marlyap.tasks.coverage import Coverage as Coverage
@@ -27,6 +28,7 @@ TASKS = {
     "rendezvous-late": Rendezvous(dynamics=LateUnicycle()),
     "rendezvous-rest": Rendezvous(rest_weight=0.03, horizon=60),
     "runaway": Runaway(),
+    "rendezvous-robust": Perturbed(Rendezvous(), drop=0.2, silent=0.5, late=0.05, measured=0.01),
     "formation": Formation(),
     "formation-di": DisplacementFormation(),
     "cartpoles": CartPoles(),

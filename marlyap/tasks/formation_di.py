@@ -68,6 +68,9 @@ class DisplacementFormation(AbstractPlanar):
         off = lambda name: name.replace("own position", "own position - displacement")
         return tuple(e._replace(name=off(e.name)) for e in entries)
 
+    def sight(self):
+        return self.local_sight()._replace(places=self.places)
+
     def costs(self, state, action):
         effort = jnp.sum(jnp.clip(action, -1.0, 1.0) ** 2, axis=1)
         gap = jnp.sum((self.goals(state) - self.positions(state)) ** 2, axis=1)

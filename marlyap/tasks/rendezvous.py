@@ -47,6 +47,9 @@ class Rendezvous(AbstractPlanar):
     def observation_entries(self):
         return self.local_entries(self.headings)
 
+    def sight(self):
+        return self.local_sight(self.headings)
+
     def costs(self, state, action):
         return with_motion(self, self.distance(state), state, self.rest_weight)
 

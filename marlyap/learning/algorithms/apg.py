@@ -3,7 +3,7 @@
     symbol             here                            meaning
     mu_phi             pi, by its mode                 deterministic decentralised policies
     l(c)               `sharp`                         c + sharpness c / (c + edge cost)
-    w_t                `weights`                       grow as t^`late`, and sum to 1
+    w_t                `weights`                       grow as t^`growth`, and sum to 1
     J(phi)             J                               E_{s_0}[ sum_t w_t l(c_t) + l(c_H) ]
     Delta_t            `rise`                          max(0, c_{t+T} - (1 - decrease) c_t)
 
@@ -46,11 +46,13 @@ class APG(AbstractAlgorithm):
     # 1,500 updates on 128 episodes each: playing is cheap where no critic is to be learnt.
     default_schedule = Schedule(steps=7_680_000, environments=128, select_every=50)
 
+    traced = ("rate_pi", "sharpness", "clip", "ema_rate", "weight", "decrease")
+
     rate_pi: float = 2e-3  # learning rate
     actor_width: int = 64  # units in each of two hidden layers
     shared: bool = False  # one set of actor weights for all agents of a kind
+    growth: float = 2.0  # of the weight of a step's cost with time; 0 weighs all steps alike
     sharpness: float = 0.5  # extra cost of being beyond the edge of success, beside the cost
-    late: float = 2.0  # costs weigh as this power of the time; 0: all alike
     clip: float = 1.0  # largest norm of a gradient
     ema_rate: float = 1e-2  # how fast the deployed policy follows the actor; 1 is the actor itself
     weight: float = 0.0  # of the decrease condition
@@ -64,9 +66,8 @@ class APG(AbstractAlgorithm):
         check_range("clip", self.clip, 0, 1e6, open=True)
         check_range("actor_width", self.actor_width, 1, 1_000_000)
         check_range("T", self.T, 1, 10_000)
-        for name in ("sharpness", "weight"):
+        for name in ("growth", "sharpness", "weight"):
             check_range(name, getattr(self, name), 0, 1e6)
-        check_range("late", self.late, 0, 10)
 
     def init(self, shape, key):
         pi = Actors(shape, self.actor_width, self.shared, key=key)
@@ -98,7 +99,7 @@ class APG(AbstractAlgorithm):
         end = charged(game, last, game.hold(last))[0]
         cost = jnp.where(ended[:, None], 0.0, jnp.concatenate([path.cost, end[None]]))
         sharp = lambda c: jnp.mean(c + self.sharpness * c / (c + game.edge_cost), axis=-1)
-        weights = jnp.arange(1, game.horizon + 1) ** self.late
+        weights = jnp.arange(1, game.horizon + 1) ** self.growth
         J = jnp.sum(weights / jnp.sum(weights) * sharp(cost[:-1])) + sharp(cost[-1])
         J = J + self.weight * self.rise(jnp.mean(cost, axis=1), game)
         return J, (path.cost, path.reward)

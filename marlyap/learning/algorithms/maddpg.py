@@ -44,6 +44,17 @@ class Networks(eqx.Module):
 class MADDPG(AbstractOffPolicy):
     """One central critic, one deterministic actor per agent on its own observation."""
 
+    traced = (
+        "gamma",
+        "tau",
+        "rate_pi",
+        "rate_Q",
+        "reward_scale",
+        "ema_rate",
+        "smoothing",
+        "smoothing_clip",
+    )
+
     gamma: float = 0.95  # discount
     tau: float = 0.005  # how fast the targets follow
     rate_pi: float = 3e-4  # actor learning rate

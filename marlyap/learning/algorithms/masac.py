@@ -52,6 +52,18 @@ class Networks(eqx.Module):
 class MASAC(AbstractOffPolicy):
     """One central twin critic, one Gaussian actor per agent on its own observation."""
 
+    traced = (
+        "gamma",
+        "tau",
+        "rate_pi",
+        "rate_Q",
+        "rate_alpha",
+        "alpha",
+        "entropy",
+        "reward_scale",
+        "ema_rate",
+    )
+
     gamma: float = 0.95  # discount
     tau: float = 0.005  # how fast the target critics follow
     rate_pi: float = 3e-4  # actor learning rate

@@ -70,6 +70,19 @@ class Lyapunov(AbstractConstraint):
     Raises UserError for values out of range and for readings and functions that do not fit.
     """
 
+    traced = (
+        "discount",
+        "decrease",
+        "weight",
+        "weight_start",
+        "floor",
+        "input_gain",
+        "clip",
+        "rate_L",
+        "rate_weight",
+        "tau",
+    )
+
     reading: str = "han"  # how Delta L is read; one of han, literal, hinge, score, critic
     function: Literal["squares", "norm"] = "squares"  # L(s, a) sum of squares, or V(s) norm-like
     horizon: int = 10  # T of L_target, in steps

@@ -25,7 +25,7 @@ class Terms(NamedTuple):
     due: Scalar  # decrease times the team's cost: L must fall by so much
     slope: Scalar  # l_L l_f, the change of L per unit of action
     scale: Scalar  # running mean square of the fall of L
-    clip: float  # the ratio of `score` stays within 1 -+ this
+    clip: Scalar | float  # the ratio of `score` stays within 1 -+ this
     agents: tuple[int, ...]  # whom the constraint is about; empty: everybody
 
     def rise(self, next_action: Action) -> Scalar:
