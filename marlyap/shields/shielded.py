@@ -81,8 +81,8 @@ class Shielded(AbstractWrapper):
     @property
     def nominal(self):
         raise UserError(
-            "shield: robots would act without it, for a bundle holds the policy alone; export a run "
-            "that was trained without a shield."
+            "shield: robots would act without it, for a bundle holds the policy alone; export a "
+            "run that was trained without a shield."
         )
 
     @property
