@@ -20,7 +20,6 @@ from typing import Any
 import equinox as eqx
 import harness
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from marlyap import MASAC, Rendezvous
@@ -70,7 +69,6 @@ def made(folder: Path) -> Path:
     game, rule = Rendezvous(horizon=10), MASAC()
     run = Run.create(folder / "run", Trainer(game, rule, Schedule()), 0, {"task": "rendezvous"})
     networks = eqx.filter_jit(rule.init)(shape(game), jax.random.key(0))
-    networks = jax.tree.map(lambda x: jnp.asarray(x) if eqx.is_array(x) else x, networks)
     deployed = rule.policy(networks), rule.lyapunov(networks)
     store.write(run.directory / "policy", "policy", flatten(deployed), {})
     runtimes = [name for name in ("numpy", "onnx", "c") if name != "onnx" or find_spec("onnx")]

@@ -166,7 +166,7 @@ GUARDS = [
     Guard(
         "20 not finite: the array, agent and update",
         FIT,
-        (("diagnose(trainer, run.load()[0], done)", "None"),),
+        (("diagnose(run.trainer, run.load()[0], done)", "None"),),
         "tests/test_resume.py::test_the_array_the_agent_and_the_update_are_named",
     ),
     Guard(

@@ -46,10 +46,15 @@ seeds = [0, 1]
 "algorithm.tau" = [0.005, 0.01]
 """
 CHILD = """
-import runpy
-import marlyap.runs.fit as f
-f.PATIENCE, f.SHARE = 0.5, 1e9
-runpy.run_module("marlyap.sweeps.worker", run_name="__main__")
+import os
+import marlyap.sweeps.worker as worker
+prepare = worker.environment.prepare
+def prepared(*given):
+    prepare(*given)
+    import marlyap.runs.fit as fit
+    fit.PATIENCE, fit.SHARE = 0.5, 1e9
+worker.environment.prepare = prepared
+os._exit(worker.main())
 """
 DRIVER = """
 import sys
@@ -79,7 +84,7 @@ def processes(token: str) -> dict[int, str]:
 
 def trainings(token: str) -> list[int]:
     """The processes that train."""
-    return [pid for pid, line in processes(token).items() if "run_module" in line and CHILD in line]
+    return [pid for pid, line in processes(token).items() if CHILD in line]
 
 
 def start(directory: Path, on: str, token: str) -> subprocess.Popen:

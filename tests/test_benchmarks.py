@@ -21,6 +21,7 @@ COLUMNS = {
     "runtimes": {"runtime", "p50 us", "p99 us"},
     "seeds": {"way", "seeds", "seeds/hour", "to one"},
     "startup": {"what", "cpu s"},
+    "sweep": {"what", "cpu s"},
     "update": {"updates/s", "needed MFLOP", "done MFLOP", "of floor", "to plain"},
 }
 
@@ -37,7 +38,8 @@ def benchmarks(monkeypatch):
 
 
 SLOW = [
-    pytest.param(name, marks=pytest.mark.slow) for name in ("agents", "peer", "runtimes", "startup")
+    pytest.param(name, marks=pytest.mark.slow)
+    for name in ("agents", "peer", "runtimes", "startup", "sweep")
 ]
 
 

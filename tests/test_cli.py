@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from marlyap.cli import main
-from marlyap.cli.parser import VERBS as TABLE
+from marlyap.cli.parser import VERBS as TABLE, parser
 from marlyap.games.game import AbstractGame
 from marlyap.runs import config
 from marlyap.runs.run import Run
@@ -121,9 +121,9 @@ def test_help_comes_at_once_and_without_jax(argv):
     assert seconds < 0.5
 
 
-def test_every_verb_is_in_the_help(capsys):
-    code, out, _ = call(capsys)
-    assert code == 0 and all(verb in out for verb in VERBS)
+def test_every_verb_is_in_the_help():
+    told = parser().format_help()
+    assert all(verb in told for verb in VERBS)
 
 
 def test_the_version(capsys):

@@ -191,7 +191,8 @@ def test_report_and_watch_show_the_game_that_was_asked(runs, capsys):
     result, _ = found(capsys, "report", runs[0], "--task.horizon", "6", "--out", "six.html")
     assert result["groups"][0]["label"].endswith("measured on horizon=6")
     films = re.search(r'id="films">(.*?)</script>', Path("six.html").read_text(), re.DOTALL)
-    assert films and all(len(film["positions"]) == 7 for film in json.loads(films[1]))
+    shown = [film for shot in json.loads(films[1]) for film in shot["films"]]
+    assert shown and all(len(film["positions"]) == 7 for film in shown)
     Path("films").mkdir()
     code, _, _ = call(capsys, "watch", runs[0], "--task.horizon", "6", "--out", "films")
     page = Path("films", "film.html").read_text()

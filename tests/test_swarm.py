@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from marlyap.deploy import contract as contracts, wire
+from marlyap.deploy import contract as contracts, swarm, wire
 from marlyap.deploy.agent import Agent, Ways
 from marlyap.deploy.bus import Hub, LocalBus, matches
 from marlyap.deploy.contract import STARTS, WEIGHTS
@@ -124,7 +124,8 @@ def test_a_pause_passes(contract, robots, starts):
     assert 1 <= episode.missed <= 3 and episode.alive.all()
 
 
-def test_a_team_in_step_that_lost_a_robot_says_so(contract, robots, starts):
+def test_a_team_in_step_that_lost_a_robot_says_so(contract, robots, starts, monkeypatch):
+    monkeypatch.setattr(swarm, "ANSWER", 1.0)
     stage = Together(robots, "red", Ways(lock=True))
     simulator = Simulator(contract, robots, stage, "red")
     stage.pause("agent_2", True)

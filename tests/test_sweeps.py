@@ -455,7 +455,7 @@ def ran(place, on, options=None):
 def test_a_sweep_is_the_same_wherever_it_runs(on, package, options, local, tmp_path):
     pytest.importorskip(package)
     found = ran(tmp_path / "q", on, options)
-    assert found == local and len({*found.values()}) == 8
+    assert found == local and len(found) == 8 and len({*found.values()}) > 2
 
 
 @pytest.mark.parametrize(("on", "package"), [("ray", "ray"), ("slurm", "submitit")])

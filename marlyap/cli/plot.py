@@ -48,6 +48,6 @@ def run(args: Namespace, overrides: Overrides) -> Result:
 
     said = {"episodes": args.episodes, "seed": starts_of(args.seed), "width": args.width}
     axes = plot(args.runs, args.what, band=args.band, **said)
-    save(axes.figure, args.out)
+    save(axes.get_figure(), args.out)
     say(f"Figure: {args.out.resolve()}")
     return {"figure": str(args.out), "what": args.what}, 0

@@ -67,7 +67,8 @@ def write(
     if out.exists() and not is_report(out):
         raise UserError(f"out: {out} exists and is not a report of marlyap; choose another file.")
     command = shlex.join(["marlyap", *sys.argv[1:]])
-    page = gather(list(runs), episodes, starts, command, list(games), task, beside)
+    begin = say if sys.stderr.isatty() else lambda text: None
+    page = gather(list(runs), episodes, starts, command, list(games), task, beside, begin)
     store.write_text_atomic(out, html(page))
     pictures = [out.with_name(f"{out.stem}-{name}") for name in ("starts.png", "learning.png")]
     trajectories_png(page.films, pictures[0])

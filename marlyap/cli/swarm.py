@@ -27,6 +27,8 @@ EXAMPLES = """
 def options(p: ArgumentParser) -> None:
     p.add_argument("bundle", type=place, metavar="BUNDLE", help="what export wrote")
     p.add_argument("--episodes", type=number, default=5, help="evaluation starts (default 5)")
+    first = "the first of them (default 0)"
+    p.add_argument("--first", type=number, default=0, help=first)
     buses = "zenoh: processes; local: in this process"
     p.add_argument("--bus", choices=("zenoh", "local"), default="zenoh", help=buses)
     p.add_argument("--team", default=None, help="its name on the bus (default: drawn)")
@@ -49,25 +51,21 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     from marlyap.deploy.agent import Ways
     from marlyap.deploy.contract import STARTS, WEIGHTS
     from marlyap.deploy.runtime import Role, read_arrays
-    from marlyap.deploy.swarm import Play, Simulator, Together
+    from marlyap.deploy.swarm import Play, Simulator
 
     contract = contracts.load(args.bundle)
     contracts.for_robots(contract, "swarm")
     starts, arrays = read_arrays(args.bundle / STARTS), read_arrays(args.bundle / WEIGHTS)
-    check_range("episodes", args.episodes, 1, len(starts["x"]))
+    check_range("first", args.first, 0, len(starts["x"]) - 1)
+    check_range("episodes", args.episodes, 1, len(starts["x"]) - args.first)
+    starts = {name: part[args.first :] for name, part in starts.items()}
     check_range("film", args.film, 0, args.episodes - 1)
     place_for(args.out)
     how = Ways(args.lock, args.wait, args.silent, args.loss, args.delay, args.jitter, args.seed)
     play = Play(args.lock, args.command_delay, events(args, contract))
     team = wire.team_name(args.team or f"swarm-{secrets.token_hex(4)}")
     robots = [Role(contract, arrays, r["name"]) for r in contract["roles"]]
-    names = [r["name"] for r in contract["roles"]]
-    if args.bus == "local":
-        stage: Any = Together(robots, team, how)
-    else:
-        from marlyap.deploy.processes import Processes
-
-        stage = Processes(args.bundle, names, team, how)
+    stage = staged(args, robots, team, how)
     played = []
     try:
         simulator = Simulator(contract, robots, stage, team)
@@ -83,6 +81,17 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     if args.out is not None:
         keep(args, contract, played, result)
     return result, 0
+
+
+def staged(args: Namespace, robots: Any, team: str, how: Any) -> Any:
+    """Where the team plays: in this process, or in one for each robot."""
+    if args.bus == "local":
+        from marlyap.deploy.swarm import Together
+
+        return Together(robots, team, how)
+    from marlyap.deploy.processes import Processes
+
+    return Processes(args.bundle, [r.role["name"] for r in robots], team, how)
 
 
 def place_for(out: Path | None) -> None:

@@ -16,7 +16,7 @@ SUMMARY = "film one episode of a run or a hand-written controller, as GIF, MP4 a
 EPILOG = (
     SUBJECT
     + """
-A training is followed in a browser by its TensorBoard files, not by this command.
+A training is followed in a browser by its TensorBoard files: tensorboard --logdir RUN
 """
 )
 EXAMPLES = """

@@ -90,7 +90,7 @@ def described(
     """The contract without its evidence."""
     sight = express.sight(game)
     obs = jax.eval_shape(lambda k: game.observations(game.reset(k)), jax.random.key(0)).shape[1]
-    plant, period = game.plant, game.dt
+    plant = game.plant
     return {
         "schema": contracts.SCHEMA,
         "task": run.labels.get("task", type(game).__name__),
@@ -115,14 +115,7 @@ def described(
             ],
             "squash": "tanh, times the limit",
         },
-        "timing": {
-            "period": period,
-            "hold": "a command is held until the next",
-            "max_own_age": OWN_AGE * period,
-            "max_neighbour_age": NEIGHBOUR_AGE * period,
-            "max_actuation_delay": None,
-            "clocks": "ages are taken on the robot's own clock; clocks need not agree",
-        },
+        "timing": timing(game.dt),
         "silent": "a neighbour that is silent for longer than max_neighbour_age is taken to stand "
         "where it was last heard (hold), or its slot is empty (absent)",
         "fallback": {
@@ -133,6 +126,18 @@ def described(
         },
         "plant": moves(game, sight),
         "domain": domain(game),
+    }
+
+
+def timing(period: float) -> dict[str, Any]:
+    """How often, how old, how late (s)."""
+    return {
+        "period": period,
+        "hold": "a command is held until the next",
+        "max_own_age": OWN_AGE * period,
+        "max_neighbour_age": NEIGHBOUR_AGE * period,
+        "max_actuation_delay": None,
+        "clocks": "ages are taken on the robot's own clock; clocks need not agree",
     }
 
 

@@ -1,7 +1,7 @@
 """What a report says of runs: their evaluations, films, certificates and how they were made."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,14 +42,15 @@ def gather(
     games: Sequence[AbstractGame] | None = None,
     called: str = "",
     beside: str = "",
+    tell: Callable[[str], None] = lambda text: None,
 ) -> Page:
     """Everything that a report shows of these runs.
 
     `games` has the game that each is measured on, by default its own, and `called` is the name of
     that game where it is not the one that a run was trained on. `beside` names the hand-written
-    controller that is filmed beside them (`filming.filmed`).
+    controller that is filmed beside them (`filming.filmed`). `tell` hears what is being done.
     """
-    told = measured(runs, episodes, seed, games, called)
+    told = measured(runs, episodes, seed, games, called, tell)
     alone = len(runs) == 1
     whose = lambda m: "" if alone else told.label(m)
     certified = [certificates(told.run(m), m.game, whose(m)) for m in told.found]
@@ -58,6 +59,7 @@ def gather(
     named = lambda m: told.run(m).labels["algorithm"] if alone else told.label(m)
     firsts = [those[0] for those in told.teams.values()]
     leads = [Lead(told.run(m), m, named(m)) for m in firsts[:MOST_FILMED]]
+    tell("filming")
     apart = groups.side_by_side([m.configuration for m in firsts])
     notes = [
         note

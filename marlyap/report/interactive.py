@@ -159,8 +159,8 @@ def _level_sets(part: Slice) -> Any:
     """Level sets of V around a goal, and in dashes the one that is certified."""
     unit = f" ({part.unit})" if part.unit else ""
     reach = (-part.reach, part.reach)
-    shown = _frame(f"x{unit}", f"y{unit}", x_range=reach, y_range=reach, match_aspect=True)
-    shown.height = 320
+    shown = _frame(f"x{unit}", f"y{unit}", x_range=reach, y_range=reach)
+    shown.update(sizing_mode="scale_width", aspect_ratio=1.0, height=None)
     values = np.asarray(part.values, np.float32)
     known = values[np.isfinite(values)]
     ground = _ground(shown, part, values, known)
@@ -197,7 +197,7 @@ def _contour(part: Slice, levels: Sequence[float]) -> dict[str, list[Any]]:
     grid = np.linspace(-part.reach, part.reach, len(part.values))
     values = np.ma.masked_invalid(part.values)
     found = contour_generator(grid, grid, values)
-    drawn = [(level, line) for level in levels for line in found.lines(level)]
+    drawn = [(level, line) for level in levels for line in map(np.asarray, found.lines(level))]
     return {
         "xs": [plain(line[:, 0], 3) for _, line in drawn],
         "ys": [plain(line[:, 1], 3) for _, line in drawn],

@@ -1,6 +1,6 @@
 """Runs measured on the same held-out starts, as the records that charts and tables are made of."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,10 +65,12 @@ def measured(
     seed: int,
     games: Sequence[AbstractGame] | None = None,
     called: str = "",
+    tell: Callable[[str], None] = lambda text: None,
 ) -> Measurement:
     """Evaluate runs, each on its game; the arguments are those of `contents.gather`."""
     found = []
-    for run, game in zip(runs, games or [run.game for run in runs], strict=True):
+    for k, (run, game) in enumerate(zip(runs, games or [r.game for r in runs], strict=True)):
+        tell(f"evaluating {run.directory} ({k + 1} of {len(runs)})")
         result = evaluate(game, run.controller(game), episodes, seed)
         found.append(groups.of_run(run, result, seed, game, called))
     names, labels = groups.labels(found, brief=True)

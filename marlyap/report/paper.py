@@ -28,7 +28,7 @@ from marlyap.storage.store import write_bytes_atomic
 BANDS = ("range", "interval")
 OF_LOGS = ("learning", "return")  # kinds that need no evaluation
 DASHES = ("-", (0, (5, 2)), (0, (1.2, 1.6)), (0, (5, 2, 1.2, 2)), (0, (8, 2)), (0, (3, 1.5)))
-STYLE: dict[str, Any] = {
+STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 8,
     "axes.labelsize": 8,
@@ -159,15 +159,15 @@ def _in_group(chart: Chart, line: Line) -> bool:
     return any(o.member is None and o.team == line.team for o in chart.lines)
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure in the format that its name ends with, fonts embedded.
+def save(figure: Any, path: Path) -> None:
+    """Write a Matplotlib figure in the format that its name ends with, fonts embedded.
 
     Raises UserError for another ending, and where the file cannot be written.
     """
     kind = path.suffix.lstrip(".").lower()
     if kind not in FORMATS:
         raise UserError(f"out: {path.name} should end in .{', .'.join(FORMATS)}.")
-    dated = {"metadata": {"CreationDate": None}} if kind == "pdf" else {}
+    dated: dict[str, Any] = {"metadata": {"CreationDate": None}} if kind == "pdf" else {}
     text = io.BytesIO()
     with styled():
         figure.savefig(text, format=kind, dpi=300, **dated)

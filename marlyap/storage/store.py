@@ -38,12 +38,13 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from marlyap.errors import UserError
+from marlyap.storage.strict import parse
 
 
 SCHEMA = 1
 PAYLOAD, MANIFEST = "arrays.safetensors", "manifest.json"
 PACKAGES = ("marlyap", "jax", "jaxlib", "equinox", "optax", "numpy")
-JSON_LIMIT, JSON_DEPTH = 16 * 2**20, 64
+JSON_LIMIT = 16 * 2**20
 RETRIES = 16  # of reading what others keep replacing
 # NumPy's name of each dtype, and that of safetensors
 DTYPES = {"bool": "BOOL", "float32": "F32", "float64": "F64"}
@@ -337,7 +338,7 @@ def _manifest(kind: str, meta: Mapping[str, Any], payload: list[Any], table: Tab
     body = {"schema": SCHEMA, "kind": kind, "meta": dict(meta), "files": files, "arrays": table}
     try:
         raw = sealed(body | {"versions": versions()})
-        _parse(raw)
+        parse(raw)
     except (TypeError, ValueError, RecursionError) as error:
         raise UserError(f"meta is not JSON ({error}); use finite numbers, text, lists.") from error
     if len(raw) > JSON_LIMIT:
@@ -449,40 +450,11 @@ def _content(path: Path, limit: int, directory: int | None = None) -> np.ndarray
 
 def _json(raw: bytes, path: Path | str) -> Any:
     try:
-        return _parse(raw)
+        return parse(raw)
     except ValueError as error:
         raise CorruptError(
             f"{path} is not sound JSON ({error}); correct it or use a copy."
         ) from None
-
-
-def _parse(raw: bytes) -> Any:
-    hooks = {"object_pairs_hook": _unique, "parse_float": _finite, "parse_constant": _finite}
-    try:
-        value = json.loads(raw.decode(), **hooks)
-    except RecursionError:
-        raise ValueError("it is nested too deeply") from None
-    level, depth = [value], 0
-    while level:
-        if (depth := depth + 1) > JSON_DEPTH:
-            raise ValueError("it is nested too deeply")
-        nodes = [[*x.values()] if isinstance(x, dict) else x for x in level]
-        level = [child for node in nodes if isinstance(node, list) for child in node]
-    json.dumps(value, ensure_ascii=False).encode()  # refuses a surrogate without its pair
-    return value
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise ValueError("a key is written twice")
-    return found
-
-
-def _finite(text: str) -> float:
-    if not math.isfinite(number := float(text)):
-        raise ValueError(f"{text[:20]} is not a finite number")
-    return number
 
 
 # --- Files, durably ------------------------------------------------------------------------------
