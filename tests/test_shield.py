@@ -46,6 +46,10 @@ GAMES = {
 each_game = pytest.mark.parametrize("name", GAMES)
 
 
+def disturbed(game, **change):
+    return Perturbed(inner=game, **change)
+
+
 def some_states(game, count, key=0):
     """Starts with rates, as in the middle of an episode; memories begin there."""
     k_start, k_rates = jax.random.split(jax.random.key(key))
@@ -179,7 +183,7 @@ def rested(game, last, off, gone):
 
 def test_a_random_policy_comes_to_rest_behind_the_shield():
     """t3, few starts; the two followers lose half of their messages."""
-    game = Shielded(Perturbed(inner=Rendezvous(), drop=0.5), Shield(steps=45))
+    game = Shielded(disturbed(Rendezvous(), drop=0.5), Shield(steps=45))
     rested(game, *ended(game, at_random(game), 12, 120))
 
 
@@ -198,7 +202,7 @@ def test_ill_policies_come_to_rest_behind_the_shield(name, sigma, full_compilati
 @pytest.mark.parametrize("window", [0, 30])
 def test_a_path_of_eight_comes_to_rest_although_messages_are_lost(window, full_compilation):
     """t3 and t8."""
-    inner = Perturbed(inner=Rendezvous(agents=8, graph="path"), drop=0.5 if window == 0 else 0.0)
+    inner = disturbed(Rendezvous(agents=8, graph="path"), drop=0.5 if window == 0 else 0.0)
     game = Shielded(inner, Shield(window=window))
     rested(game, *ended(game, at_random(game), 40, 600))
 
@@ -206,7 +210,7 @@ def test_a_path_of_eight_comes_to_rest_although_messages_are_lost(window, full_c
 def test_a_prediction_undoes_a_known_delay():
     """One step late, every agent by itself moves as it would have without the delay."""
     game = Rendezvous(agents=1)
-    late = Perturbed(inner=game, delay=1)
+    late = disturbed(game, delay=1)
     start = game.reset(jax.random.key(0))
     act = Predicting(TreePursuit(late), late)
     roll = eqx.filter_jit(lambda g, a, s: rollout(g, a, s, jax.random.key(1), 12).state.x)
@@ -216,7 +220,7 @@ def test_a_prediction_undoes_a_known_delay():
 
 
 def test_a_shield_plans_from_where_its_inputs_under_way_lead():
-    game = Shielded(Perturbed(inner=Rendezvous(), delay=2), Shield(steps=10))
+    game = Shielded(disturbed(Rendezvous(), delay=2), Shield(steps=10))
     s = some_states(Shielded(Rendezvous(), Shield(steps=10)), 1)
     inside = jax.tree.map(lambda x: x[0], s)
     start = game.reset(jax.random.key(0))
@@ -287,7 +291,7 @@ def test_a_certificate_names_the_conditions_that_fail():
     assert [text.partition(":")[0] for text in ill] == [
         "model", "terminal set", "sums", "goals", "plans",
     ]  # fmt: skip
-    alone = Shielded(Perturbed(inner=Rendezvous(graph="path"), cut=((0, 1),)), Shield(steps=30))
+    alone = Shielded(disturbed(Rendezvous(graph="path"), cut=((0, 1),)), Shield(steps=30))
     assert "tree" in faults(alone, well, none)[0]
 
 
@@ -295,7 +299,7 @@ def test_a_certificate_names_the_conditions_that_fail():
 def test_a_certificate_tests_the_model_that_is_planned_with(full_compilation):
     game = Shielded(Rendezvous(), Shield(steps=60))
     assert max(float(x) for x in inexact(game, jax.random.key(0)).values()) < 1e-3
-    strong = game.beneath(lambda g: Perturbed(inner=g, gain=1.1))
+    strong = game.beneath(lambda g: disturbed(g, gain=1.1))
     assert float(inexact(strong, jax.random.key(0))["model"]) > 0.01
 
 
@@ -308,7 +312,7 @@ def test_a_shielded_team_is_certified_whatever_its_policy(full_compilation):
     assert verdict.holds and verdict.evidence == "proved" and "by construction" in verdict.claim
     assert verdict.figures["steps_of_a_leader"] <= verdict.bound
     assert verdict.figures["paid_over_bound"] <= 1 + 1e-4
-    weak = game.beneath(lambda g: Perturbed(inner=g, gain=0.8))
+    weak = game.beneath(lambda g: disturbed(g, gain=0.8))
     verdict = replace(CERTIFICATES["shielded"], rollouts=5).check(
         ClosedLoop(weak, at_random(weak)), 0
     )
@@ -317,7 +321,7 @@ def test_a_shielded_team_is_certified_whatever_its_policy(full_compilation):
 
 def test_pushes_and_jumps_come_every_so_often_and_at_no_other_time():
     plain = Rendezvous()
-    game = Perturbed(inner=plain, push=2.0, jump=3.0, every=4)
+    game = disturbed(plain, push=2.0, jump=3.0, every=4)
     act = jnp.zeros((3, 2))
     step = eqx.filter_jit(game.step)
     s = game.reset(jax.random.key(0))
@@ -330,7 +334,7 @@ def test_pushes_and_jumps_come_every_so_often_and_at_no_other_time():
     goal = np.asarray(s.scenario.goal)
     assert (np.abs(goal) <= 3).all() and np.ptp(goal, axis=0).max() < 1e-5
     with pytest.raises(UserError, match="cannot be pushed"):
-        cart = Perturbed(inner=TASKS["cartpoles"], push=1.0)
+        cart = disturbed(TASKS["cartpoles"], push=1.0)
         jax.eval_shape(cart.step, cart.reset(jax.random.key(0)), jnp.zeros((5, 1)))
 
 

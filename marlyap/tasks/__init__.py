@@ -28,7 +28,7 @@ TASKS = {
     "rendezvous-late": Rendezvous(dynamics=LateUnicycle()),
     "rendezvous-rest": Rendezvous(rest_weight=0.03, horizon=60),
     "runaway": Runaway(),
-    "rendezvous-robust": Perturbed(
+    "rendezvous-robust": Perturbed(  # pyright: ignore[reportCallIssue] -- the rest is inner's
         inner=Rendezvous(), drop=0.2, silent=0.5, late=0.05, measured=0.01
     ),
     "formation": Formation(),
