@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from marlyap.certificates.certify import certify as certify
     from marlyap.certificates.lyapunov import AbstractLyapunov as AbstractLyapunov
     from marlyap.controllers import AbstractController as AbstractController, as_action as as_action
+    from marlyap.controllers.predicting import Predicting as Predicting
     from marlyap.errors import UserError as UserError
     from marlyap.games.dynamics import (
         AbstractDynamics as AbstractDynamics,
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
         LateUnicycle as LateUnicycle,
         SingleIntegrator as SingleIntegrator,
         Unicycle as Unicycle,
+        UnstablePoint as UnstablePoint,
     )
     from marlyap.games.game import (
         AbstractGame as AbstractGame,
@@ -58,6 +60,7 @@ if TYPE_CHECKING:
     from marlyap.runs.fit import train as train
     from marlyap.runs.launch import Launch as Launch, launch as launch
     from marlyap.runs.run import Run as Run, load_policy as load_policy
+    from marlyap.shields import Shield as Shield, Shielded as Shielded
     from marlyap.simulation.evaluation import (
         Evaluation as Evaluation,
         compare as compare,
@@ -89,6 +92,7 @@ PUBLIC = {
     "certificates.certify": ("certify",),
     "certificates.lyapunov": ("AbstractLyapunov",),
     "controllers": ("AbstractController", "as_action"),
+    "controllers.predicting": ("Predicting",),
     "errors": ("UserError",),
     "games.dynamics": (
         "AbstractDynamics",
@@ -96,6 +100,7 @@ PUBLIC = {
         "LateUnicycle",
         "SingleIntegrator",
         "Unicycle",
+        "UnstablePoint",
     ),
     "games.game": ("AbstractGame", "AbstractRegulation", "Tolerance"),
     "games.perturbed": ("Perturbed",),
@@ -116,6 +121,7 @@ PUBLIC = {
     "runs.fit": ("train",),
     "runs.launch": ("Launch", "launch"),
     "runs.run": ("Run", "load_policy"),
+    "shields": ("Shield", "Shielded"),
     "simulation.evaluation": ("Evaluation", "compare", "evaluate"),
     "simulation.rollout": ("AbstractExplorer", "Decentralised", "rollout"),
     "report.curves": ("plot_sweep",),

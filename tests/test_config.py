@@ -17,6 +17,7 @@ from marlyap.learning.hosted import Hosted
 from marlyap.learning.trainer import SCHEDULES, Schedule, Trainer
 from marlyap.runs import config
 from marlyap.runs.run import Run
+from marlyap.shields import Shield, Shielded
 from marlyap.tasks import TASKS, Rendezvous
 
 
@@ -356,6 +357,8 @@ def test_records_with_one_field_replaced_are_refused_or_round_trip(kind, draw):
     members += [
         Hosted("pettingzoo:mpe2.simple_spread_v3"),
         Schedule(),
+        Shield(),
+        Shielded(TASKS["rendezvous"]),
         *(game.plant for game in TASKS.values()),
     ]
     thing = next(o for o in members if type(o).__name__ == kind)

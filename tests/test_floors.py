@@ -31,6 +31,7 @@ FLOORS = """
     simulation
     nets
     controllers
+    shields
     learning
     certificates
     conformance

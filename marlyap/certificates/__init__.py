@@ -12,6 +12,7 @@ from marlyap.certificates.quantiles import Quantiles
 from marlyap.certificates.reach import Reach, ReachAndStay
 from marlyap.certificates.robustness import Robustness
 from marlyap.certificates.safety import Apart, Safe
+from marlyap.certificates.shielded import Shielded
 from marlyap.certificates.theorem1 import Theorem1
 
 
@@ -28,6 +29,7 @@ CERTIFICATES: dict[str, AbstractCertificate] = {
     "theorem1": Theorem1(),
     "composition": Composition(),
     "linearisation": Linearisation(),
+    "shielded": Shielded(),  # for games behind a shield only
     "ellipsoid": Ellipsoid(),
     "closed-form": ClosedForm(),  # for the point-offset law only
 }

@@ -21,7 +21,7 @@ from marlyap.certificates.loop import ClosedLoop
 from marlyap.certificates.lyapunov import AbstractLyapunov, measured as measured
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame, AbstractRegulation
-from marlyap.games.perturbed import Perturbed
+from marlyap.games.wrapper import plain_game as plain_game
 from marlyap.seeds import Purpose, stream
 from marlyap.simulation.rollout import Controller, all_finite, rollout, until
 from marlyap.statistics import lower_bound, trials_needed
@@ -322,11 +322,6 @@ def of_share(certificate: Any, loop: ClosedLoop, seed: int, found: Found, claim:
         worst=worst_of(loop.game, seed, "certify", found, found.asked) if n else None,
         figures={"share_asked": certificate.share, "drawn": len(found.holds)} | dict(claim.figures),
     )
-
-
-def plain_game(game: AbstractGame) -> AbstractGame:
-    """The game inside all perturbations."""
-    return plain_game(game.inner) if isinstance(game, Perturbed) else game
 
 
 def arrival(game: AbstractGame) -> str:

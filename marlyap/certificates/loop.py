@@ -7,8 +7,9 @@ import jax
 
 from marlyap.certificates.lyapunov import AbstractLyapunov, CostSum
 from marlyap.errors import UserError
-from marlyap.games.game import AbstractGame, AbstractRegulation
+from marlyap.games.game import AbstractGame, AbstractRegulation, regulated
 from marlyap.games.perturbed import Perturbed, nominal_limits, traced
+from marlyap.games.wrapper import AbstractWrapper
 from marlyap.simulation.rollout import Controller
 
 
@@ -49,7 +50,8 @@ class ClosedLoop(eqx.Module):
 
         Raises UserError for a perturbation that cannot be applied to this game.
         """
-        game = traced(Perturbed(inner=self.game, **change))
+        struck = lambda game: traced(Perturbed(inner=regulated(game), **change))
+        game = regulated(self.game.beneath(struck))
         eqx.filter_eval_shape(game.reset, jax.random.key(0))  # a game may refuse to move its starts
         return ClosedLoop(game, self.controller, self.V)
 
@@ -59,10 +61,7 @@ def seen_through(game: AbstractGame, observer: T, what: str = "controller") -> T
 
     Raises UserError where it was made for another game.
     """
-    known, eyes = [game, nominal_limits(game)], nominal_limits(game)
-    while isinstance(game, Perturbed):
-        game = game.inner
-        known += [game, nominal_limits(game)]
+    known, eyes = [k for g in views(game) for k in (g, nominal_limits(g))], nominal_limits(game)
 
     def replaced(part: Any) -> Any:
         if not isinstance(part, AbstractGame):
@@ -75,3 +74,12 @@ def seen_through(game: AbstractGame, observer: T, what: str = "controller") -> T
         return eyes
 
     return jax.tree.map(replaced, observer, is_leaf=lambda part: isinstance(part, AbstractGame))
+
+
+def views(game: AbstractGame) -> list[AbstractGame]:
+    """The game, and what it is without some of what wraps it: a controller may be made for any."""
+    if not isinstance(game, AbstractWrapper):
+        return [game]
+    below = views(game.inner)
+    rewrapped = [eqx.tree_at(lambda g: g.inner, game, inner) for inner in below[1:]]
+    return [game, *rewrapped, *below]

@@ -14,7 +14,8 @@ EPILOG = SUBJECT
 EXAMPLES = """
   marlyap certify runs/demo/seed0
   marlyap certify runs/demo/seed0 --certificates reach --task.size 2 --out certificate
-  marlyap certify tree-pursuit --task rendezvous --out certificate"""
+  marlyap certify tree-pursuit --task rendezvous --out certificate
+  marlyap certify runs/demo/seed0 --shield --certificates shielded --out certificate"""
 
 
 def options(p: ArgumentParser) -> None:
@@ -43,7 +44,9 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     from marlyap.games.game import regulated
     from marlyap.seeds import stream
 
-    controller, game, out = claims.about(args.run, args.task, args.algorithm, overrides, args.out)
+    controller, game, out = claims.about(
+        args.run, args.task, args.algorithm, overrides, args.out, args.shield
+    )
     if out.exists() and not args.force:
         raise UserError(f"out: {out} already exists; choose another or add --force.")
     usual = claims.usual(game)

@@ -15,13 +15,19 @@ from marlyap.games.game import AbstractGame
 from marlyap.runs import config
 from marlyap.runs.run import one_run
 from marlyap.runs.subject import asked, subject
+from marlyap.shields import split
 
 
 SAMPLED = ("reach", "reach-and-stay", "decrease", "contraction", "basin", "quantiles")
 
 
 def about(
-    word: str, task: str | None, algorithm: str | None, overrides: Overrides, out: Path | None
+    word: str,
+    task: str | None,
+    algorithm: str | None,
+    overrides: Overrides,
+    out: Path | None,
+    shield: bool = False,
 ) -> tuple[Any, AbstractGame, Path]:
     """The controller, its game, and where the certificate goes.
 
@@ -32,10 +38,10 @@ def about(
         if task is None or out is None:
             missing = "--task TASK" if task is None else "--out DIRECTORY"
             raise UserError(f"certify: {word} is a controller, not a run; add {missing}.")
-        game = asked(task, overrides)
+        game = asked(task, overrides, shield)
         return config.load_controller(word, game), game, out
     place = one_run(word)
-    run, game = subject(place, task, algorithm, overrides)
+    run, game = subject(place, task, algorithm, overrides, shield)
     controller = run.controller(game)
     for note in run.warnings:
         say(note)
@@ -49,7 +55,13 @@ def about(
 
 def usual(game: AbstractGame) -> tuple[str, ...]:
     """The certificates to ask for where none is named."""
-    return (*SAMPLED, "linearisation", "ellipsoid", *(("safe",) if has_rules(game) else ()))
+    some = {"safe": has_rules(game), "shielded": split(game)[1] is not None}
+    return (
+        *SAMPLED,
+        "linearisation",
+        "ellipsoid",
+        *(name for name, is_so in some.items() if is_so),
+    )
 
 
 def chosen(names: Iterable[str], rollouts: int | None) -> dict[str, AbstractCertificate]:

@@ -14,6 +14,8 @@ EPILOG = SUBJECT
 EXAMPLES = """
   marlyap evaluate runs/demo
   marlyap evaluate runs/demo/seed0 --task rendezvous-late
+  marlyap evaluate runs/demo --starts-scale 3 --push 5
+  marlyap evaluate runs/demo/seed0 --shield --shield.sigma 0
   marlyap evaluate runs/demo/seed0 tree-pursuit --task rendezvous --task.size 2"""
 
 
@@ -24,6 +26,12 @@ def options(p: ArgumentParser) -> None:
     p.add_argument("--seed", type=seed_of_starts, default=0, help=SEED)
     p.add_argument("--confidence", type=float, default=0.95, help="of the intervals")
     p.add_argument("--out", type=place, default=None, help="file for the figures, as JSON")
+    p.add_argument("--horizon", type=number, default=None, help="steps of an episode")
+    p.add_argument("--starts-scale", type=float, default=1.0, help="how many times as far they are")
+    push = "every horizon all rates of each agent jump by + or - this much (SI units)"
+    p.add_argument("--push", type=float, default=0.0, help=push)
+    jump = "every horizon the target moves anywhere in [-JUMP, JUMP]^2 (m)"
+    p.add_argument("--jump", type=float, default=0.0, help=jump)
 
 
 def run(args: Namespace, overrides: Overrides) -> Result:
@@ -45,7 +53,8 @@ def run(args: Namespace, overrides: Overrides) -> Result:
         return hosted.evaluate(args, overrides)
     starts = starts_of(args.seed)
     refuse_all_but_task(overrides)
-    named = figures.Named(args.runs, args.task, args.algorithm, overrides)
+    harder = figures.Harder(args.horizon, args.starts_scale, args.push, args.jump)
+    named = figures.Named(args.runs, args.task, args.algorithm, overrides, args.shield, harder)
     found, notes = figures.measured(named, args.episodes, starts, args.confidence)
     result = {
         "start_seed": starts,
@@ -61,7 +70,7 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     if args.out is not None:
         store.write_text_atomic(args.out, json.dumps(result, indent=1) + "\n")
     if not args.json:
-        figures.show(result, found)
+        figures.show(result, found, harder.words())
     for note in notes:
         say(note)
     return result, 0

@@ -16,12 +16,43 @@ from marlyap.certificates.safety import rules
 from marlyap.cli.common import Overrides
 from marlyap.controllers import CONTROLLERS, names_a_controller
 from marlyap.errors import UserError
+from marlyap.games.game import AbstractGame, regulated
+from marlyap.games.perturbed import Perturbed
 from marlyap.report.measuring import progress
 from marlyap.runs import config, groups
 from marlyap.runs.run import Run, expand
 from marlyap.runs.subject import asked, subject
 from marlyap.simulation.evaluation import RESTS, evaluate
 from marlyap.storage import store
+
+
+@dataclass(frozen=True)
+class Harder:
+    """How much harder than in training the game is: longer, from afar, pushed, a jumping target."""
+
+    horizon: int | None = None  # steps; None: the game's own
+    spread: float = 1.0  # how many times as far out episodes begin
+    push: float = 0.0  # at the end of every horizon, in SI units
+    jump: float = 0.0  # of the target, likewise (m)
+
+    def of(self, game: AbstractGame) -> AbstractGame:
+        """The game made harder; itself if nothing is asked.
+
+        Raises UserError for a game without a target set, whose starts or agents cannot be moved.
+        """
+        game = game if self.horizon is None else game.lasting(self.horizon)
+        change = {"spread": self.spread, "push": self.push, "jump": self.jump}
+        if change == {"spread": 1.0, "push": 0.0, "jump": 0.0}:
+            return game
+        change["every"] = game.horizon
+        return game.beneath(lambda inner: Perturbed(regulated(inner), **change))  # pyright: ignore
+
+    def words(self) -> str:
+        """What was asked, for the title of the table."""
+        parts = {"starts {:g} times as far": self.spread if self.spread != 1 else 0.0}
+        parts |= {"pushes of {:g} every horizon": self.push}
+        parts |= {"the target jumps in {:g} m every horizon": self.jump}
+        return "".join(f"; {text.format(x)}" for text, x in parts.items() if x)
 
 
 @dataclass(frozen=True)
@@ -32,6 +63,8 @@ class Named:
     task: str | None
     algorithm: str | None
     overrides: Overrides
+    shield: bool = False  # whether all of it is measured behind a shield
+    harder: Harder = Harder()
 
 
 def measured(
@@ -41,7 +74,8 @@ def measured(
 
     A run keeps the figures of its own game as evaluation.json.
     """
-    game = asked(named.task, named.overrides) if named.task else None
+    harder = named.harder.of
+    game = harder(asked(named.task, named.overrides, named.shield)) if named.task else None
     found: list[groups.Measured] = []
     directories, notes = [], []
     for word in named.words:
@@ -56,7 +90,8 @@ def measured(
             hint = config.suggest(word, CONTROLLERS)
             raise UserError(f"run: there is no run or controller '{word}'; {hint}")
     for directory in expand(directories):
-        run, there = subject(directory, named.task, named.algorithm, named.overrides)
+        run, there = subject(directory, named.task, named.algorithm, named.overrides, named.shield)
+        there = harder(there)
         notes += run.warnings
         result = evaluate(there, run.controller(there), episodes, starts)
         found.append(groups.of_run(run, result, starts, there, named.task or ""))
@@ -84,7 +119,7 @@ def keep(run: Run, row: dict[str, Any]) -> list[str]:
     return []
 
 
-def show(result: dict[str, Any], found: Sequence[groups.Measured]) -> None:
+def show(result: dict[str, Any], found: Sequence[groups.Measured], words: str = "") -> None:
     """The evaluation as a table on standard output, and what it says in words."""
     rows, teams = result["runs"], result["groups"]
     first, arrivals = rows[0], {arrival(m.game) for m in found}
@@ -92,9 +127,12 @@ def show(result: dict[str, Any], found: Sequence[groups.Measured]) -> None:
     heads, table = _table(result, found)
     console = Console()
     console = console if console.is_terminal else Console(width=max(console.width, 110))
-    table.title = f"{first['episodes']} held-out starts of seed {result['start_seed']}; "
+    table.title = f"{first['episodes']} held-out starts of seed {result['start_seed']}{words}; "
     table.title += f"success at the last step: {reached}"
     console.print(table)
+    for row in rows:
+        if row["beyond_steps"]:
+            console.print(f"{row['name']}, later: {later(row)}", highlight=False, markup=False)
     units = {row["unit"] for row in rows}
     unit = units.pop() if len(units) == 1 else "in the unit of each task"
     horizons = 1 + max(m.evaluation.beyond / m.game.horizon for m in found)
@@ -129,6 +167,16 @@ class Column(NamedTuple):
 
     head: str
     says: Callable[[dict[str, Any]], str]
+
+
+def later(row: dict[str, Any]) -> str:
+    """What became of it until the end of the watch, in words."""
+    at_end = row["end_speed"]["0.95"]
+    said = f"{share(row['lost'])} % lost (farther off at the end than at the start)"
+    said += f", 95 % of the worst distances swing by at most {number(row['swing']['0.95'])}"
+    said += f" in the last horizon, and the fastest end at {number(at_end)} m/s"
+    back = row["back"]
+    return said if back is None else f"{said}; {100 * back:.1f} % of horizons end in success"
 
 
 def share(part: dict[str, Any] | None) -> str:

@@ -29,6 +29,7 @@ code needs --task path/to/file.py:Name for that code. Any other task is measured
 NAMED = "a name that `marlyap list` shows, or path/to/file.py:Name"
 TRACKERS = "trackers that are told as well: wandb, mlflow, trackio (CSV, TensorBoard: always)"
 OWN_TASK = "the task to measure on (default: that of each run; needed for controllers)"
+SHIELD = "behind a credit shield (docs/stability.md), set by --shield.FIELD"
 SEED = "of the starts (default 0), or the word draw for starts that nobody has seen"
 
 
@@ -87,6 +88,7 @@ def place(text: str) -> Path:
 def measured_on(p: argparse.ArgumentParser, task: str) -> None:
     """What a policy is measured on."""
     p.add_argument("--task", default=None, help=task)
+    p.add_argument("--shield", action="store_true", help=SHIELD)
     p.add_argument(
         "--algorithm", default=None, help="the algorithm of a run where it is your own code"
     )

@@ -101,7 +101,7 @@ def parser() -> Parser:
     return top
 
 
-PARTS = ("task", "algorithm", "schedule")
+PARTS = ("task", "shield", "algorithm", "schedule")
 
 
 def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, dict[str, str]]:

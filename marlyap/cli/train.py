@@ -5,7 +5,15 @@ from dataclasses import replace
 
 from marlyap.cli.common import Overrides, Result, say
 from marlyap.cli.environment import prepare
-from marlyap.cli.options import NAMED, OVERRIDES, TRACKERS, Once, number, place
+from marlyap.cli.options import (
+    NAMED,
+    OVERRIDES,
+    SHIELD,
+    TRACKERS,
+    Once,
+    number,
+    place,
+)
 from marlyap.errors import UserError
 from marlyap.runs.job import Launch
 
@@ -15,6 +23,7 @@ EPILOG = OVERRIDES
 EXAMPLES = """
   marlyap train rendezvous masac-lyapunov
   marlyap train formation masac --seeds 0 1 2 --steps 100000 --task.agents 5
+  marlyap train rendezvous masac --shield --shield.action residual
   marlyap train platoon.py:Platoon apg
   marlyap train --resume runs/rendezvous/masac-lyapunov/seed0
   marlyap train --resume runs/rendezvous/masac/seed0 --steps 500000
@@ -41,6 +50,7 @@ def options(p: ArgumentParser) -> None:
     own = "where a resumed run's is your own code"
     p.add_argument("--task", dest="own_task", help=f"the task, {own}")
     p.add_argument("--algorithm", dest="own_algorithm", help=f"the algorithm, {own}")
+    p.add_argument("--shield", action="store_true", help=SHIELD)
     p.add_argument("--parallel", default="auto", help="seeds: auto, process (one a core) or vmap")
     p.add_argument("--device", default=None, help="cpu or gpu (default: what JAX finds)")
     p.add_argument(
@@ -58,6 +68,7 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     if args.resume:
         given = {"--seeds": args.seeds, "--preset": args.preset, "--from": args.origin}
         given |= {"--out": args.out, "--force": args.force or None}
+        given |= {"--shield": args.shield or None}
         given |= {f"--{path}": value for path, value in overrides.items()}
         for option in [k for k, v in given.items() if v is not None]:
             raise UserError(f"{option}: a resumed run keeps its settings; leave it out.")
@@ -71,7 +82,7 @@ def run(args: Namespace, overrides: Overrides) -> Result:
             raise UserError(f"{option}: it is for --resume; a new run is train TASK ALGORITHM.")
         if not args.task or not args.algorithm:
             raise UserError("train: name a task and an algorithm, as in train rendezvous masac.")
-        asked = training.Asked(args.task, args.algorithm, args.preset, args.steps)
+        asked = training.Asked(args.task, args.algorithm, args.preset, args.steps, args.shield)
         runs = training.create(asked, overrides, args.seeds or ["0"], args.out, args.force)
         if args.origin is not None:
             training.start_from(runs, args.origin, args.task, args.algorithm)

@@ -32,7 +32,10 @@ from marlyap.controllers.platoon_feedback import (
     PlatoonOVM as PlatoonOVM,
 )
 from marlyap.controllers.point_offset import PointOffset as PointOffset
-from marlyap.controllers.pursuit import TreePursuit as TreePursuit
+from marlyap.controllers.pursuit import (
+    PointPursuit as PointPursuit,
+    TreePursuit as TreePursuit,
+)
 from marlyap.controllers.quad_chain import (
     QuadChain as QuadChain,
     QuadChainSpace as QuadChainSpace,
@@ -59,6 +62,7 @@ CONTROLLERS: dict[str, type[AbstractController]] = {
     "gradient-consensus": GradientConsensus,
     "lin-francis-maggiore": LinFrancisMaggiore,
     "tree-pursuit": TreePursuit,
+    "point-pursuit": PointPursuit,
     "optimal-control": OptimalControl,
     "formation-consensus": FormationConsensus,
     "formation-linear": FormationFeedback,

@@ -11,12 +11,12 @@ from jaxtyping import Array, Float
 
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
-from marlyap.games.perturbed import Perturbed
 from marlyap.games.planar import AbstractPlanar
+from marlyap.games.wrapper import AbstractWrapper
 from marlyap.types import Action, Key, State
 
 
-Robots = AbstractPlanar | Perturbed  # robots in the plane, disturbed or not
+Robots = AbstractPlanar | AbstractWrapper  # robots in the plane, as they are or wrapped
 
 
 class AbstractController(eqx.Module):

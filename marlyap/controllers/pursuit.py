@@ -7,8 +7,9 @@ from jaxtyping import Array, Int
 from marlyap import graph as graphs
 from marlyap.controllers.cascade import Cascade
 from marlyap.controllers.controller import AbstractController, Robots, as_action, headings
+from marlyap.controllers.drives import PointDrive, drive_of
 from marlyap.games.dynamics import LateUnicycle, Unicycle
-from marlyap.types import State
+from marlyap.types import Links, State
 
 
 class TreePursuit(AbstractController):
@@ -42,12 +43,41 @@ class TreePursuit(AbstractController):
 
     def parents(self, state: State) -> Int[Array, "agent"]:
         """The parent of each agent, -1 where there is no path to a leader."""
-        linked, n = self.game.linked(state), self.game.agents
-        if graphs.disk_radius(self.game.graph) is None:
-            hops = jnp.asarray(graphs.hops(self.game.adjacency, self.game.informed))
-        else:
-            start = jnp.where(jnp.asarray(self.game.leads), 0, n)
-            relax = lambda _, h: jnp.minimum(h, 1 + jnp.min(jnp.where(linked, h[None], n), axis=1))
-            hops = jax.lax.fori_loop(0, n - 1, relax, start)
-        seen = jnp.where(linked, hops[None], n)
-        return jnp.where(jnp.min(seen, axis=1) < n, jnp.argmin(seen, axis=1), -1)
+        return parents(self.game, self.game.linked(state))
+
+
+class PointPursuit(AbstractController):
+    """Drive a leader to its goal, a follower to where its parent will stop: for point masses.
+
+    As `TreePursuit`, by the law of `drives.PointDrive`, also for those that run away by themselves.
+    """
+
+    drives = PointDrive.moves
+
+    game: Robots
+
+    def __call__(self, state, key):
+        game, law = self.game, drive_of(self.game)
+        parent = parents(game, game.linked(state))
+        places = jnp.asarray(game.displacements, state.x.dtype)
+        ends = jax.vmap(lambda x: law.stop(game, x))(state.x)
+        follow = ends[parent] + places - places[parent]
+        q = jnp.where((parent >= 0)[:, None], follow, ends)
+        q = jnp.where(jnp.asarray(game.leads)[:, None], game.goals(state), q)
+        return as_action(game, jax.vmap(lambda x, q: law.drive(game, x, q))(state.x, q))
+
+
+def parents(game: Robots, linked: Links) -> Int[Array, "agent"]:
+    """The parent of each agent over these links, -1 where there is no path to a leader.
+
+    It is the neighbour with the fewest hops to a leader, the lowest index among equals.
+    """
+    n = game.agents
+    if graphs.disk_radius(game.graph) is None:
+        hops = jnp.asarray(graphs.hops(game.adjacency, game.informed))
+    else:
+        start = jnp.where(jnp.asarray(game.leads), 0, n)
+        relax = lambda _, h: jnp.minimum(h, 1 + jnp.min(jnp.where(linked, h[None], n), axis=1))
+        hops = jax.lax.fori_loop(0, n - 1, relax, start)
+    seen = jnp.where(linked, hops[None], n)
+    return jnp.where(jnp.min(seen, axis=1) < n, jnp.argmin(seen, axis=1), -1)

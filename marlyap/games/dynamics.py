@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from marlyap.errors import check_range
 from marlyap.games.physics import AbstractPlant, Integrator, check_inputs, integrate
 from marlyap.types import Entry
 
@@ -210,6 +211,41 @@ class DoubleIntegrator(AbstractDynamics):
         return x[2:]
 
 
+class UnstablePoint(AbstractDynamics):
+    """x, y (m), vx, vy (m/s); v' = growth v + u: left alone, a velocity grows by exp(growth t).
+
+    Beyond |v| = limit / growth on an axis no input brings it back.
+    """
+
+    limits: tuple[float, ...] = (2.0, 2.0)  # largest ax and ay (m/s^2)
+    integrator: Integrator = "euler"
+    growth: float = 1.0  # 1/s
+    names: ClassVar[tuple[str, ...]] = ("x", "y", "vx", "vy")
+    inputs: ClassVar[tuple[str, ...]] = ("ax", "ay")
+    units: ClassVar[tuple[str, ...]] = ("m", "m", "m/s", "m/s")
+    input_units: ClassVar[tuple[str, ...]] = ("m/s^2", "m/s^2")
+    felt: ClassVar[tuple[str, ...]] = ("vx", "vy")
+    blocks: ClassVar[tuple[tuple[int, ...], ...]] = ((2, 3), (0, 1))
+
+    def __check_init__(self):
+        check_range("growth", self.growth, 0, 1e3, open=True)
+
+    def field(self, x, u):
+        return jnp.concatenate([x[2:], self.growth * x[2:] + u])
+
+    def position(self, x):
+        return x[:2]
+
+    def heading(self, x):
+        return jnp.array([1.0, 0.0])
+
+    def velocity(self, x):
+        return x[2:]
+
+    def rates(self, x):
+        return x[2:]
+
+
 class SingleIntegrator(AbstractDynamics):
     """x, y (m), driven by a velocity (m/s)."""
 
@@ -241,6 +277,7 @@ DYNAMICS = {
     "unicycle": Unicycle(),
     "late-unicycle": LateUnicycle(),
     "double-integrator": DoubleIntegrator(),
+    "unstable-point": UnstablePoint(),
     "single-integrator": SingleIntegrator(),
 }
 

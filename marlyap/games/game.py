@@ -10,6 +10,7 @@ learning rule. Three abstract classes, each a kind of the one before:
 
 import abc
 import dataclasses
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -175,6 +176,31 @@ class AbstractGame(eqx.Module):
         raise UserError(
             f"spread: the starts of {type(self).__name__} cannot be moved; leave out spread."
         )
+
+    def pushed(self, state: State, size: float | Array, key: Key) -> State:
+        """The state after a push: all rates of each agent jump by +-`size`, in their units."""
+        raise UserError(
+            f"push: the agents of {type(self).__name__} cannot be pushed; leave it out."
+        )
+
+    def retargeted(self, state: State, size: float | Array, key: Key) -> State:
+        """The state with the target anywhere in [-size, size]^2 (m)."""
+        raise UserError(f"jump: the target of {type(self).__name__} cannot jump; leave it out.")
+
+    def lasting(self, horizon: int) -> "AbstractGame":
+        """The same game with episodes of so many steps."""
+        return dataclasses.replace(self, horizon=horizon)  # pyright: ignore
+
+    def beneath(self, change: Callable[["AbstractGame"], "AbstractGame"]) -> "AbstractGame":
+        """`change` of this game; of one behind a shield, the same shield before `change` of it.
+
+        What disturbs a plant (noise, weak motors, delays) does so after the shield has decided.
+        """
+        return change(self)
+
+    def underway(self, state: State) -> Float[Array, "delay agent du"]:
+        """The actions that were asked for and have no effect yet, the next one first."""
+        return jnp.zeros((0, self.agents, self.du))
 
     def aside(self, state: State, gone: Bool[np.ndarray, "agent"]) -> State:
         """The state with those that are `gone` out of everybody's way."""

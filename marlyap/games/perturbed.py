@@ -1,24 +1,22 @@
 """The same game, disturbed: what a controller meets that it was not made for."""
 
-import dataclasses
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from marlyap import graph as graphs
 from marlyap.errors import UserError
 from marlyap.games.dynamics import AbstractDynamics
 from marlyap.games.game import AbstractGame, AbstractRegulation
 from marlyap.games.physics import AbstractPlant
+from marlyap.games.wrapper import AbstractWrapper
 from marlyap.seeds import branch
 from marlyap.types import Action, State
 
 
-class Perturbed(AbstractRegulation):
+class Perturbed(AbstractWrapper):
     """`inner` with stronger or weaker inputs, noise, delay, lost messages, agents or edges.
 
     A controller made for `inner` drives it unchanged. Every method of `inner` is asked, with the
@@ -40,6 +38,9 @@ class Perturbed(AbstractRegulation):
     gone: tuple[int, ...] = ()  # agents that are missing
     cut: tuple[tuple[int, int], ...] = ()  # edges that are missing
     spread: float | Array = 1.0  # starts lie this many times as far out
+    push: float | Array = 0.0  # every so often all rates of an agent jump by + or - this (SI)
+    jump: float | Array = 0.0  # every so often the target moves anywhere in [-jump, jump]^2 (m)
+    every: int = 40  # steps from one push or jump to the next
     silent: float = 0.0  # probability that in an episode a follower stops and falls silent
     late: float = 0.0  # s up to which, drawn anew each episode, inputs act late; less than dt
     measured: float = 0.0  # standard deviation of what is measured of the states, in their units
@@ -49,6 +50,8 @@ class Perturbed(AbstractRegulation):
             raise UserError("perturbation: gain and spread must lie between 0 and 100.")
         if not 0 <= self.noise < 100 or not 0 <= self.drop <= 1 or not 0 <= self.delay <= 1000:
             raise UserError("perturbation: noise, delay and drop must not be negative, drop <= 1.")
+        if not 0 <= self.push < 1e6 or not 0 <= self.jump < 1e6 or self.every < 1:
+            raise UserError("perturbation: push and jump must not be negative, every at least 1.")
         self._robots()
         missing = {*self.gone, *(i for edge in self.cut for i in edge)}
         if not missing <= set(range(self.inner.agents)):
@@ -88,16 +91,6 @@ class Perturbed(AbstractRegulation):
     horizon = property(lambda self: self.inner.horizon)  # pyright: ignore[reportAssignmentType]
 
     @property
-    def slots(self) -> Int[np.ndarray, "agent slot"]:
-        """Those of the game inside: the shape of what agents see stays."""
-        return self.inner.slots
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or name == "inner":
-            raise AttributeError(name)
-        return getattr(self.inner, name)
-
-    @property
     def driven(self) -> AbstractGame:
         """The game inside, with inputs as strong as they are here."""
         return self.inner.strengthened(self.gain) if _on(self.gain - 1) else self.inner
@@ -123,14 +116,6 @@ class Perturbed(AbstractRegulation):
             linked[a, b] = linked[b, a] = False
         return linked
 
-    def strengthened(self, gain):
-        return dataclasses.replace(self, inner=self.inner.strengthened(gain))
-
-    def inside(self, state: State) -> State:
-        """The state as the game inside knows it."""
-        memory = state.memory["inner"]
-        return State(x=state.x, scenario=state.scenario, t=state.t, memory=memory)
-
     def reset(self, key):
         start = self.inner.reset(key)
         if _on(self.spread - 1):
@@ -151,6 +136,9 @@ class Perturbed(AbstractRegulation):
         key = jax.random.fold_in(self._key(state, 1), state.t)
         return linked & ~jax.random.bernoulli(key, self.drop, linked.shape)
 
+    def underway(self, state):
+        return jnp.concatenate([super().underway(state), state.memory["queue"]])
+
     def observe(self, state, links):
         inside = self.inside(state)
         if self.measured:
@@ -159,31 +147,22 @@ class Perturbed(AbstractRegulation):
             inside = eqx.tree_at(lambda s: s.x, inside, x)
         return self.inner.observe(inside, links)
 
-    def observation_entries(self):
-        return self.inner.observation_entries()
-
-    def sight(self):
-        return self.inner.sight()
-
-    @property
-    def nominal(self):
-        return self.inner.nominal
-
     def step(self, state, action):
         queue = jnp.concatenate([state.memory["queue"], action[None]])
         now, key = queue[0], jax.random.fold_in(self._key(state, 2), state.t)
         if _on(self.noise):
             now = now + self.noise * jax.random.normal(key, now.shape)
-        before = self.inside(state)
-        after = self._acting_late(state, now) if self.late else self.driven.step(before, now)
+        before = self._struck(state)
+        late = lambda: self._acting_late(state, before, now)
+        after = late() if self.late else self.driven.step(before, now)
         memory = state.memory | {"queue": queue[1:], "inner": after.memory}
         memory |= {"last": now} if self.late else {}
         x = self._stopped(state, before.x, after.x) if self.silent else after.x
         return State(x=x, scenario=after.scenario, t=after.t, memory=memory)
 
-    def _acting_late(self, state: State, action: Action) -> State:
-        """The step in which the last action still acts at first."""
-        before, plant = self.inside(state), self.plant
+    def _acting_late(self, state: State, before: State, action: Action) -> State:
+        """The step from `before` in which the last action still acts at first."""
+        plant = self.plant
         late = jax.random.uniform(self._key(state, 5), (), maxval=self.late)
         time, x = before.t * self.dt, before.x
         for asked, seconds in ((state.memory["last"], late), (action, self.dt - late)):
@@ -205,78 +184,23 @@ class Perturbed(AbstractRegulation):
         gone = jax.random.bernoulli(k_whether, self.silent) & (state.t >= when)
         return gone & (jnp.arange(self.agents) == who)
 
-    def outside(self, inside: State, state: State) -> State:
-        """A state of the game inside, with what this one remembers in `state`."""
+    def _struck(self, state: State) -> State:
+        """The state inside, pushed or with another target where the time for it has come."""
+        inside, due = self.inside(state), (state.t > 0) & (state.t % self.every == 0)
+        for size, purpose in ((self.push, 6), (self.jump, 7)):
+            if _on(size):
+                strike = self.inner.pushed if purpose == 6 else self.inner.retargeted
+                key = jax.random.fold_in(self._key(state, purpose), state.t)
+                struck = strike(inside, size, key)
+                inside = jax.tree.map(lambda a, b: jax.lax.select(due, a, b), struck, inside)
+        return inside
+
+    def outside(self, inside, state):
         memory = state.memory | {"inner": inside.memory}
         return State(x=inside.x, scenario=inside.scenario, t=inside.t, memory=memory)
 
-    def features(self, state):
-        return self.inner.features(self.inside(state))
-
-    def terminated(self, state):
-        return self.inner.terminated(self.inside(state))
-
-    def failed(self, state):
-        return self.inner.failed(self.inside(state))
-
-    @property
-    def failure_cost(self):
-        return self.inner.failure_cost
-
-    @property
-    def edge(self):
-        return self.inner.edge
-
-    @property
-    def edge_cost(self):
-        return self.inner.edge_cost
-
-    @property
-    def unit(self):
-        return self.inner.unit
-
-    @property
-    def smooth(self):
-        return self.inner.smooth
-
-    @property
-    def tolerances(self):
-        return self.inner.tolerances
-
-    @property
-    def leads(self):
-        return self.inner.leads
-
-    @property
-    def kinds(self):
-        return self.inner.kinds
-
-    def error_entries(self):
-        return self.inner.error_entries()
-
     def hold(self, state):
         return self.driven.hold(self.inside(state))
-
-    def at_target(self, state):
-        return self.outside(self.inner.at_target(self.inside(state)), state)
-
-    def farther(self, state, factor):
-        return self.outside(self.inner.farther(self.inside(state), factor), state)
-
-    def aside(self, state, gone):
-        return self.outside(self.inner.aside(self.inside(state), gone), state)
-
-    def scene(self, state):
-        return self.inner.scene(self.inside(state))
-
-    def signals(self, state):
-        return self.inner.signals(self.inside(state))
-
-    def resized(self, agents):
-        return dataclasses.replace(self, inner=self.inner.resized(agents))
-
-    def positions(self, state):
-        return self.inner.positions(self.inside(state))
 
     def distance(self, state):
         return self._judged(state, self.inner.distance(self.inside(state)))
@@ -293,7 +217,7 @@ class Perturbed(AbstractRegulation):
 
     def success(self, state):
         some = self.gone or self.silent
-        return super().success(state) if some else self.inner.success(self.inside(state))
+        return AbstractGame.success(self, state) if some else super().success(state)
 
     def violations(self, state):
         # Nobody collides with an agent that is gone.
@@ -327,16 +251,21 @@ def judges_as_a_team(game: AbstractGame) -> tuple[str, str] | None:
 
 def traced(game: Perturbed) -> Perturbed:
     """The same with its numbers as arrays, so that jit compiles once for all of their values."""
-    numbers = lambda g: (g.gain, g.noise, g.drop, g.spread)
+    # A game whose agents cannot be pushed must not be asked to: off stays off.
+    struck = tuple(name for name in ("push", "jump") if _on(getattr(game, name)))
+    names = ("gain", "noise", "drop", "spread", *struck)
+    numbers = lambda g: tuple(getattr(g, name) for name in names)
     return eqx.tree_at(numbers, game, tuple(jnp.asarray(float(x)) for x in numbers(game)))
 
 
 def nominal_limits(game: AbstractGame) -> AbstractGame:
     """The same, perturbed in all but the strength of its inputs: what a controller is told."""
+    if not isinstance(game, AbstractWrapper):
+        return game
+    game = eqx.tree_at(lambda g: g.inner, game, nominal_limits(game.inner))
     if not isinstance(game, Perturbed):
         return game
-    parts = lambda g: (g.inner, g.gain)
-    return eqx.tree_at(parts, game, (nominal_limits(game.inner), jnp.asarray(1.0)))
+    return eqx.tree_at(lambda g: g.gain, game, jnp.asarray(1.0))
 
 
 def _on(x: float | Array) -> bool:

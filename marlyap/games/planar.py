@@ -117,6 +117,29 @@ class AbstractPlanar(AbstractRegulation):
         """The start with positions `factor` times as far from the origin."""
         return eqx.tree_at(lambda s: s.x, state, state.x.at[:, :2].multiply(factor))
 
+    def pushed(self, state, size, key):
+        rates = jnp.array(self.dynamics.blocks[0])
+        sign = jax.random.rademacher(key, (self.agents, len(rates)), state.x.dtype)
+        return eqx.tree_at(lambda s: s.x, state, state.x.at[:, rates].add(size * sign))
+
+    def retargeted(self, state, size, key):
+        """The goals moved together, so that their mean is drawn anew."""
+        middle = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0) * size
+        goal = state.scenario.goal
+        goal = goal + (middle - jnp.mean(goal, axis=0))[None]
+        return eqx.tree_at(lambda s: s.scenario.goal, state, goal)
+
+    @property
+    def displacements(self) -> Float[np.ndarray, "agent 2"]:
+        """Where each agent's goal lies from the common centre (m), as all of them know beforehand.
+
+        Raises UserError where a follower cannot tell its place from that of its neighbour.
+        """
+        raise UserError(
+            f"displacements: the followers of {type(self).__name__} cannot tell their places from "
+            "their neighbours'; say how they lie in `displacements`."
+        )
+
     def aside(self, state, gone):
         away = jnp.where(jnp.asarray(gone), 1e4 * (1 + jnp.arange(self.agents)), 0.0)
         return eqx.tree_at(lambda s: s.x, state, state.x.at[:, :2].add(away[:, None]))

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from marlyap.recheck import checks
+from marlyap.recheck import checks, shield
 from marlyap.recheck.bounds import lower
 from marlyap.recheck.checks import Case, near
 from marlyap.recheck.linear import linearisation
@@ -50,6 +50,7 @@ ASKED = {
     "Safe": SAMPLED | dict(stay=WHOLE),
     "Apart": SAMPLED | dict(calibration=WHOLE, stay=WHOLE, least=NUMBER),
     "Linearisation": dict(scenes=WHOLE, margin=NUMBER, decay=NUMBER),
+    "Shielded": dict(rollouts=WHOLE),
     "Ellipsoid": dict(scenes=WHOLE),
     "Proof": dict(c=NUMBER, rho=NUMBER, inner=NUMBER, half=LIST, eta=NUMBER, decay=NUMBER)
     | dict(most=WHOLE, batch=WHOLE, resume=(str, NONE), show=FLAG),
@@ -124,6 +125,8 @@ def derive(
     whole = all(v["holds"] for v in verdicts.values())
     if not (whole and meta["left_out"]):  # what is left out may have been optional, or not
         agree("whether all hold", whole, meta["holds"])
+    if meta["game"].get("kind") == "Shielded":
+        return behind_shield(arrays, meta, kinds, tail, tell)
     if what := unknown(meta["game"], meta["controller"]):
         left = {
             name: counted(v, asked[name], kinds[name], tail, what) for name, v in verdicts.items()
@@ -150,6 +153,36 @@ def derive(
             continue
         done[name] = found
         tell(name, v)
+    holds = None if left else meta["holds"]
+    return {"agrees": not left, "holds": holds, "rechecked": done, "not_rechecked": left}
+
+
+def behind_shield(
+    arrays: Arrays,
+    meta: dict[str, Any],
+    kinds: dict[str, str],
+    tail: float,
+    tell: Callable[[str, dict[str, Any]], None],
+) -> dict[str, Any]:
+    """`derive` for a game behind a shield: what the shield is certified for, and counts.
+
+    Whether an action is admitted may turn on the last digit, so that no other figure of a rollout
+    can be asked to agree.
+    """
+    game, asked, done, left = meta["game"], meta["certificates"], {}, {}
+    record("the game", game, dict(kind=TEXT, inner=OBJECT, shield=OBJECT))
+    what = unknown(game["inner"], meta["controller"]) or shield.unknown(game)
+    for name, v in meta["verdicts"].items():
+        if what or kinds[name] != "Shielded":
+            of = what or "single rollouts behind a shield"
+            left[name] = counted(v, asked[name], kinds[name], tail, of)
+            continue
+        sim = World(meta, arrays)
+        case = Case(sim, Sentences(game["inner"], meta["V"]), v, asked[name], tail)
+        done[name] = shield.check(case, game["shield"])
+        tell(name, v)
+    why = "it was left out, and whether it had to be is not known here"
+    left |= dict.fromkeys(meta["left_out"], why)
     holds = None if left else meta["holds"]
     return {"agrees": not left, "holds": holds, "rechecked": done, "not_rechecked": left}
 
@@ -225,6 +258,7 @@ def left_out(
         return {}
     T = re.fullmatch(r"contraction: (\d{1,9}) steps .*", str(why))
     fits = {"Safe": say.no_rule()}
+    fits |= {"Shielded": say.no_shield()}
     fits |= {"Apart": say.alone()} if sim.game["agents"] == 1 else {}
     fits |= {"Contraction": say.too_long(int(T[1]))} if T and int(T[1]) > say.H else {}
     if fits.get(kind) == why:
@@ -243,6 +277,8 @@ def unchecked(sim: World, kind: str) -> str:
     """Why a verdict of a kind that is known cannot be derived here."""
     if kind == "Safe":
         raise Rejected("certificate: safe is about rules, and a rendezvous has none.")
+    if kind == "Shielded":
+        raise Rejected("certificate: shielded is about games behind a shield, and this has none.")
     if kind == "Ellipsoid":
         return "a proof by intervals is not repeated here; repeat it with marlyap certify"
     if sim.game["agents"] != 1:

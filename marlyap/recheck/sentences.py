@@ -85,6 +85,9 @@ class Sentences:
     def no_derivative(self) -> str:
         return "the closed loop has no derivative at the goal"
 
+    def no_shield(self) -> str:
+        return "shielded: the game has no shield that is on; add --shield, or leave it out."
+
     def not_zero(self, worst: str, usual: str) -> str:
         return (
             f"V, {self.V}, is {worst} on the target set, where it must be 0 (it is {usual} at a "

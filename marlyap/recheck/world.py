@@ -58,6 +58,8 @@ class World:
 
     def __init__(self, meta: dict[str, Any], arrays: Arrays):
         self.game, self.controller, self.V = meta["game"], meta["controller"], meta["V"]
+        if self.game["kind"] == "Shielded":
+            self.game = self.game["inner"]
         self.arrays, self.seed, self.cache = arrays, meta["seed"], {}
         self.used = {"controller/words"}
         record("the game", self.game, GAME)
@@ -74,7 +76,11 @@ class World:
         self.layers, self.shared = self.network("controller/policy.pi.net", pi["net"]), pi["shared"]
         pi = {"kind": "Actors", "net": pi["net"], "shared": self.shared is True}
         pi |= {"du": len(self.limits)}
-        whole = {"kind": "Decentralised", "policy": {"kind": "Greedy", "pi": pi}, "game": self.game}
+        whole = {
+            "kind": "Decentralised",
+            "policy": {"kind": "Greedy", "pi": pi},
+            "game": meta["game"],
+        }
         agree("what the controller is made of", whole, self.controller)
         text = json.dumps(self.controller, sort_keys=True).encode()
         if arrays["controller/words"].tobytes() != text:

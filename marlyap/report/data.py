@@ -62,6 +62,10 @@ class Figures(Share):
     at_rest: Share | None = None  # of a game with a map, as are speed and spin
     stayed: Share | None = None
     beyond_steps: int | None = None  # steps after the last over which `stayed` looks
+    lost: Share | None = None  # farther off when those end than at the start, and not arrived
+    back: Number = None  # of the ends of later horizons, the share with success
+    end_speed: Quantiles = field(default_factory=dict)  # m/s, of the fastest agent, when they end
+    swing: Quantiles = field(default_factory=dict)  # of the worst distance in the last horizon
     violations: Share | None = None
     final_distance: Quantiles = field(default_factory=dict)
     final_speed: Quantiles = field(default_factory=dict)  # m/s, of the fastest agent

@@ -157,6 +157,7 @@ def _afterwards(group: Group) -> str:
     if group.beyond_steps:
         more = words.integer(group.beyond_steps)
         parts.append(f"stays for {more} steps more: {share(group.stayed)}")
+        parts.append(f"lost by then: {share(group.lost)}")
     return "; ".join(parts)
 
 

@@ -10,6 +10,8 @@ from marlyap.learning.algorithms import PRESETS
 from marlyap.learning.trainers import ready, trainer_for, usual_schedule
 from marlyap.learning.training import AbstractTrainer
 from marlyap.runs import config
+from marlyap.runs.subject import unfolded
+from marlyap.shields import behind
 
 
 @dataclass(frozen=True)
@@ -20,6 +22,7 @@ class Asked:
     algorithm: str
     preset: str | None = None
     steps: int | None = None
+    shield: bool = False  # whether it is trained behind one
 
     @property
     def names(self) -> dict[str, str]:
@@ -45,12 +48,10 @@ def parts(asked: Asked, overrides: Mapping[str, str]) -> dict[str, Any]:
     game = config.load_task(asked.task)
     algorithm = PRESETS[preset](config.load(asked.algorithm, AbstractAlgorithm))
     schedule = usual_schedule(game, algorithm, preset)
-    made = {"task": game, "algorithm": algorithm, "schedule": schedule}
+    made = unfolded(game, asked.shield, overrides)
+    made |= {"algorithm": algorithm, "schedule": schedule}
     made = config.override_all(made, overrides)
     if asked.steps is not None:
         made["schedule"] = config.override(made["schedule"], "steps", str(asked.steps))
-    return {
-        "game": ready(made["task"]),
-        "algorithm": made["algorithm"],
-        "schedule": made["schedule"],
-    }
+    game = ready(behind(made["task"], made.get("shield")))
+    return {"game": game, "algorithm": made["algorithm"], "schedule": made["schedule"]}

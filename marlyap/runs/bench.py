@@ -86,7 +86,7 @@ def cells(
     for name, game in games.items():
         laws = [c for c in suited(game) if names is None or c in names]
         for horizons in dict.fromkeys((1, plan.longer)):
-            long = dataclasses.replace(game, horizon=horizons * game.horizon)  # pyright: ignore
+            long = game.lasting(horizons * game.horizon)
             for law in laws:
                 cls = CONTROLLERS[law]
                 found.append(Cell(name, law, horizons, cls, long, record(cls(game))))

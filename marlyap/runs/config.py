@@ -32,6 +32,7 @@ from marlyap.learning.constraint import AbstractConstraint
 from marlyap.learning.constraints import CONSTRAINTS
 from marlyap.learning.hosted import Hosted
 from marlyap.learning.schedule import Schedule
+from marlyap.shields import Shield, Shielded
 from marlyap.tasks import TASKS
 
 
@@ -60,7 +61,8 @@ def known() -> dict[str, type]:
     """The classes that a record may name without anyone's leave."""
     members = [o for family in FAMILIES.values() for o in family.values()]
     found = {cls.__name__: cls for o in members for cls in classes_in(o)}
-    return found | {"Schedule": Schedule, "Hosted": Hosted}
+    more = (Schedule, Hosted, Shield, Shielded)
+    return found | {cls.__name__: cls for cls in more}
 
 
 def suggest(word: str, among: Iterable[str]) -> str:

@@ -20,7 +20,14 @@ from marlyap.simulation.evaluation import Evaluation, compare, pooled
 from marlyap.statistics import mean_interval
 
 
-SHARES = ("failed", "held", "at_rest", "stayed", "violations")  # of a summary, where it has them
+SHARES = (
+    "failed",
+    "held",
+    "at_rest",
+    "stayed",
+    "lost",
+    "violations",
+)  # of a summary, where it has them
 MOST_PAIRS = 100
 
 

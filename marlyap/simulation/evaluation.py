@@ -36,6 +36,10 @@ class Outcome(eqx.Module):
     stayed: Bool[Array, ""]  # success from the horizon to the end of the rollout, in every step
     speed: Scalar  # the fastest agent's speed past its goal at the horizon (m/s); 0 without a map
     spin: Scalar  # the fastest agent's rate of turn at the horizon (rad/s); 0 without frames
+    back: Scalar  # of the later horizons' ends, the share with success; NaN where there is none
+    ended: Scalar  # the fastest agent's speed at the end of the rollout (m/s); 0 without a map
+    swing: Scalar  # largest - least worst distance in the rollout's last horizon (`unit`)
+    lost: Bool[Array, ""]  # at the rollout's end beyond the edge and farther off than at the start
     settled: Scalar  # the time from which success lasts until the horizon (s); inf if it does not
     violated: Bool[Array, ""]  # an agent broke a rule at some step until the horizon
     total: Scalar  # return until the horizon: the undiscounted sum of the team's rewards
@@ -47,16 +51,25 @@ def outcome(game: AbstractGame, trajectory: Trajectory) -> Outcome:
     seen = until(trajectory, game.horizon)
     before, last = (jax.tree.map(lambda x, k=k: x[k], seen.state) for k in (-2, -1))
     speed, spin = motion(game, before, last)
+    end = jax.tree.map(lambda x: x[-1], trajectory.state)
     success = jax.vmap(game.success)(trajectory.state)
     inside = success[: game.horizon + 1]
     lasts = jnp.cumprod(inside[::-1])[::-1].astype(bool)
-    sound = all_finite(seen)
+    sound, whole = all_finite(seen), all_finite(trajectory)
+    last_two = (jax.tree.map(lambda x, k=k: x[k], trajectory.state) for k in (-2, -1))
+    worst = jnp.max(jax.vmap(game.distance)(trajectory.state), axis=1)
+    late = worst[-game.horizon :]
+    swing = jnp.max(late) - jnp.min(late)
     return Outcome(
         success=inside[-1] & sound,
         failed=game.failed(last),
         final=jnp.where(sound, jnp.max(game.distance(last)), jnp.nan),
         held=jnp.all(inside[-HELD:]) & sound,
-        stayed=jnp.all(success[game.horizon :]) & all_finite(trajectory),
+        stayed=jnp.all(success[game.horizon :]) & whole,
+        back=jnp.mean(success[2 * game.horizon :: game.horizon].astype(float)),
+        ended=jnp.where(whole, jnp.max(motion(game, *last_two)[0]), jnp.inf),
+        swing=jnp.where(whole, swing, jnp.inf),
+        lost=~whole | (worst[-1] > jnp.maximum(worst[0], game.edge)) | game.failed(end),
         speed=jnp.max(speed),
         spin=jnp.max(spin),
         settled=jnp.where(lasts[-1] & sound, jnp.argmax(lasts) * game.dt, jnp.inf),
@@ -140,6 +153,10 @@ class Evaluation(eqx.Module):
     stayed: Bool[np.ndarray, "episode"]  # success from the horizon until `beyond` steps after it
     speed: Float[np.ndarray, "episode"]  # largest at the horizon (m/s)
     spin: Float[np.ndarray, "episode"]  # largest rate of turn at the horizon (rad/s)
+    back: Float[np.ndarray, "episode"]  # of the ends of later horizons, the share with success
+    ended: Float[np.ndarray, "episode"]  # largest speed when `beyond` ends (m/s)
+    swing: Float[np.ndarray, "episode"]  # of the worst distance in the last horizon (`unit`)
+    lost: Bool[np.ndarray, "episode"]  # then beyond the edge and farther off than at the start
     settled: Float[np.ndarray, "episode"]  # s; inf where it does not
     violated: Bool[np.ndarray, "episode"]  # a rule was broken until the horizon
     total: Float[np.ndarray, "episode"]  # return
@@ -172,6 +189,9 @@ class Evaluation(eqx.Module):
             | {"failed": share(self.failed, confidence)}
             | {"held": share(self.held, confidence)}
             | {"stayed": share(self.stayed, confidence), "beyond_steps": self.beyond}
+            | {"lost": share(self.lost, confidence)}
+            | {"back": float(np.mean(self.back)) if np.isfinite(self.back).all() else None}
+            | {"end_speed": quantiles(self.ended), "swing": quantiles(self.swing)}
             | {"violations": share(self.violated, confidence)}
             | {"final_distance": quantiles(self.final), "settling_time": quantiles(self.settled)}
             | {"return_mean": float(np.mean(self.total)), "cost_mean": float(np.mean(self.cost))}

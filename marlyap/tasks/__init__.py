@@ -17,6 +17,7 @@ from marlyap.tasks.quads_planar import PlanarFormation as PlanarFormation
 from marlyap.tasks.quads_space import SpaceFormation as SpaceFormation
 from marlyap.tasks.rendezvous import Rendezvous as Rendezvous
 from marlyap.tasks.ring import Ring as Ring
+from marlyap.tasks.runaway import Runaway as Runaway
 from marlyap.tasks.voltage import PowerFlow, Voltage as Voltage
 
 
@@ -26,6 +27,7 @@ TASKS = {
     "rendezvous-hard": Rendezvous(agents=5, graph="path", dynamics=Unicycle(limits=(2.0, 2.0))),
     "rendezvous-late": Rendezvous(dynamics=LateUnicycle()),
     "rendezvous-rest": Rendezvous(rest_weight=0.03, horizon=60),
+    "runaway": Runaway(),
     "rendezvous-robust": Perturbed(  # pyright: ignore[reportCallIssue] -- the rest is inner's
         inner=Rendezvous(), drop=0.2, silent=0.5, late=0.05, measured=0.01
     ),

@@ -48,6 +48,10 @@ class DisplacementFormation(AbstractPlanar):
         angle = 2 * np.pi * np.arange(self.agents) / self.agents
         return self.spread * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
+    @property
+    def displacements(self):
+        return self.places
+
     def reset(self, key):
         start = scatter(self.dynamics, self.agents, self.size, key)
         return replace(start, scenario=Goals(start.scenario.goal + self.places))

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from marlyap.errors import UserError, check_range
@@ -32,6 +33,10 @@ class Rendezvous(AbstractPlanar):
         if not 0 < self.size < 1e6:
             raise UserError(f"size: {self.size} m must be a positive distance in metres.")
         check_range("rest_weight", self.rest_weight, 0, 1e6)
+
+    @property
+    def displacements(self):
+        return np.zeros((self.agents, 2))
 
     def reset(self, key):
         return scatter(self.dynamics, self.agents, self.size, key)
