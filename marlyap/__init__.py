@@ -53,7 +53,7 @@ if TYPE_CHECKING:
         Simulated as Simulated,
     )
     from marlyap.learning.trainer import Trainer as Trainer
-    from marlyap.report.curves import plot_runs as plot_runs, plot_sweep as plot_sweep
+    from marlyap.report.curves import plot_sweep as plot_sweep
     from marlyap.report.paper import plot as plot
     from marlyap.runs.fit import train as train
     from marlyap.runs.launch import Launch as Launch, launch as launch
@@ -118,7 +118,7 @@ PUBLIC = {
     "runs.run": ("Run", "load_policy"),
     "simulation.evaluation": ("Evaluation", "compare", "evaluate"),
     "simulation.rollout": ("AbstractExplorer", "Decentralised", "rollout"),
-    "report.curves": ("plot_runs", "plot_sweep"),
+    "report.curves": ("plot_sweep",),
     "sweeps.folder": ("Sweep",),
     "sweeps.go": ("make_sweep", "run_sweep"),
     "sweeps.plan": ("Plan",),

@@ -13,6 +13,7 @@ from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.algorithms import ALGORITHMS, MASAC, PRESETS, DecentralisedSAC
 from marlyap.learning.constraint import Unconstrained
 from marlyap.learning.constraints import CONSTRAINTS, Lyapunov
+from marlyap.learning.hosted import Hosted
 from marlyap.learning.trainer import SCHEDULES, Schedule, Trainer
 from marlyap.runs import config
 from marlyap.runs.run import Run
@@ -352,7 +353,11 @@ def test_a_run_that_others_edited_opens_or_is_refused(run, data, value):
 @given(st.sampled_from(sorted(config.known())), st.data())
 def test_records_with_one_field_replaced_are_refused_or_round_trip(kind, draw):
     members = [o for fam in config.FAMILIES.values() for o in fam.values()]
-    members += [Schedule(), *(game.plant for game in TASKS.values())]
+    members += [
+        Hosted("pettingzoo:mpe2.simple_spread_v3"),
+        Schedule(),
+        *(game.plant for game in TASKS.values()),
+    ]
     thing = next(o for o in members if type(o).__name__ == kind)
     name = draw.draw(st.sampled_from(sorted(config.fields(thing)) or ["x"]))
     data = edited(thing, **{name: draw.draw(LEAVES | st.lists(LEAVES, max_size=3))})

@@ -6,6 +6,7 @@ from pathlib import Path
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
 from marlyap.learning.algorithm import AbstractAlgorithm
+from marlyap.learning.hosted import Hosted
 from marlyap.runs import config
 from marlyap.runs.run import Run
 
@@ -62,8 +63,9 @@ def refuse_all_but_task(overrides: Mapping[str, str]) -> None:
             raise UserError(f"--{path}: only a training sets it; here --task.FIELD can be set.")
 
 
-def supplies(task: str, given: AbstractGame, run: Run) -> bool:
+def supplies(task: str, given: AbstractGame | Hosted, run: Run) -> bool:
     """Whether the named task is the code of the run's own game."""
     name = task.rpartition(":")[2]
-    own = type(given) is type(run.game) and bool(config.own_classes(given))
-    return own and name in (type(run.game).__name__, run.labels["task"])
+    there = run.trainer.game
+    own = type(given) is type(there) and bool(config.code_of(given, task))
+    return own and name in (type(there).__name__, run.labels["task"])
