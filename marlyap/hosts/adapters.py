@@ -117,7 +117,8 @@ def side(name: str, seen: Any, decided: Any) -> Side:
                 f"task: agent {name} has an {what} space of kind {kind}, and only boxes can be "
                 f"learnt here{more if what == 'action' else ''}; wrap the environment."
             )
-    low, high = (np.asarray(x, float).ravel().tolist() for x in (decided.low, decided.high))
+    wide = lambda x: np.broadcast_to(np.asarray(x, float), decided.shape).ravel().tolist()
+    low, high = wide(decided.low), wide(decided.high)
     return Side(name, int(np.prod(seen.shape)), tuple(low), tuple(high))
 
 
