@@ -55,7 +55,7 @@ if TYPE_CHECKING:
         Simulated as Simulated,
     )
     from marlyap.learning.trainer import Trainer as Trainer
-    from marlyap.report.curves import plot_runs as plot_runs, plot_sweep as plot_sweep
+    from marlyap.report.curves import plot_sweep as plot_sweep
     from marlyap.report.paper import plot as plot
     from marlyap.runs.fit import train as train
     from marlyap.runs.launch import Launch as Launch, launch as launch
@@ -124,7 +124,7 @@ PUBLIC = {
     "shields": ("Shield", "Shielded"),
     "simulation.evaluation": ("Evaluation", "compare", "evaluate"),
     "simulation.rollout": ("AbstractExplorer", "Decentralised", "rollout"),
-    "report.curves": ("plot_runs", "plot_sweep"),
+    "report.curves": ("plot_sweep",),
     "sweeps.folder": ("Sweep",),
     "sweeps.go": ("make_sweep", "run_sweep"),
     "sweeps.plan": ("Plan",),

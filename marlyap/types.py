@@ -83,7 +83,7 @@ class Transition(eqx.Module):
     cost: Float[Array, "agent"]  # c(s_t, a_t); the team's cost is the mean
     next_obs: Obs
     next_features: Features
-    discount: Scalar
+    discount: Float[Array, "*agent_or_none"]  # of each agent where they may leave one by one
     cost_to_go: Float[Array, "agent"]  # L_target, the sum of the next T costs
     cost_ahead: Float[Array, "agent"]  # c_{t+T}
     noise: Float[Array, "agent 2 du"]  # standard normal, for the actions drawn at s and at s'

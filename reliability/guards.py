@@ -80,7 +80,7 @@ GUARDS = [
     Guard(
         "10 edited manifest",
         STORE,
-        (('raw != _sealed({key: found[key] for key in found if key != "sha256"})', "False"),),
+        (('raw != sealed({key: found[key] for key in found if key != "sha256"})', "False"),),
         "tests/test_store.py::test_an_edited_manifest_is_detected",
     ),
     Guard(
@@ -166,7 +166,7 @@ GUARDS = [
     Guard(
         "20 not finite: the array, agent and update",
         FIT,
-        (("diagnose(run.trainer, run.load()[0], done)", "None"),),
+        (("run.trainer.diagnose(run.load()[0], done)", "None"),),
         "tests/test_resume.py::test_the_array_the_agent_and_the_update_are_named",
     ),
     Guard(
@@ -174,8 +174,8 @@ GUARDS = [
         FIT,
         (
             (
-                "told.health_of(i), trainer.game.agents)\n            if fault and",
-                "told.health_of(i), trainer.game.agents) and None\n            if fault and",
+                "told.health_of(i), trainer.agents)\n            if fault and",
+                "told.health_of(i), trainer.agents) and None\n            if fault and",
             ),
         ),
         "tests/test_resume.py::test_when_all_diverge_training_stops_and_the_checkpoints_stay",

@@ -52,7 +52,6 @@ def main() -> int:
     from marlyap.learning.algorithms import MASAC
     from marlyap.learning.constraints import Lyapunov
     from marlyap.learning.trainer import Schedule, Trainer
-    from marlyap.runs.fit import advance
     from marlyap.runs.run import Run, begin, flatten
     from marlyap.tasks import Rendezvous
 
@@ -96,7 +95,7 @@ def main() -> int:
         print(f"{saved.step} iterations", flush=True)
 
         first, sizes = begin(trainer, 5), []
-        for done, carry, _ in advance(trainer, first):  # noqa: B007
+        for done, carry, _ in trainer.advance(first):  # noqa: B007
             sizes.append(resident())
             if done == saved.step:
                 break

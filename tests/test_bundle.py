@@ -17,7 +17,7 @@ from marlyap.deploy.plant import MOTIONS, coasted, step
 from marlyap.deploy.runtime import Role, read_arrays
 from marlyap.deploy.starts import played
 from marlyap.errors import UserError
-from marlyap.games.dynamics import DYNAMICS
+from marlyap.games.dynamics import DYNAMICS, Unicycle
 from marlyap.learning.algorithms import ALGORITHMS
 from marlyap.tasks import TASKS
 from marlyap.tasks.formation_di import DisplacementFormation
@@ -266,7 +266,7 @@ CASES = {
     "disk": Rendezvous(agents=4, graph="disk:0.9", horizon=4, dynamics=DYNAMICS["late-unicycle"]),
     "places": DisplacementFormation(agents=3, horizon=4),
     "alone": Rendezvous(agents=1, horizon=4, dynamics=DYNAMICS["single-integrator"]),
-    "rk4": Rendezvous(agents=2, horizon=4, dynamics=DYNAMICS["unicycle"]),
+    "rk4": Rendezvous(agents=2, horizon=4, dynamics=Unicycle(integrator="rk4")),
 }
 FAST: set[str] = set()
 every_case = [pytest.param(k, marks=[] if k in FAST else [pytest.mark.slow]) for k in CASES]

@@ -13,6 +13,7 @@ from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.algorithms import ALGORITHMS, MASAC, PRESETS, DecentralisedSAC
 from marlyap.learning.constraint import Unconstrained
 from marlyap.learning.constraints import CONSTRAINTS, Lyapunov
+from marlyap.learning.hosted import Hosted
 from marlyap.learning.trainer import SCHEDULES, Schedule, Trainer
 from marlyap.runs import config
 from marlyap.runs.run import Run
@@ -354,6 +355,7 @@ def test_a_run_that_others_edited_opens_or_is_refused(run, data, value):
 def test_records_with_one_field_replaced_are_refused_or_round_trip(kind, draw):
     members = [o for fam in config.FAMILIES.values() for o in fam.values()]
     members += [
+        Hosted("pettingzoo:mpe2.simple_spread_v3"),
         Schedule(),
         Shield(),
         Shielded(TASKS["rendezvous"]),

@@ -27,6 +27,7 @@ FLOORS = """
     compute
     games
     tasks
+    hosts
     simulation
     nets
     controllers
@@ -38,6 +39,9 @@ FLOORS = """
     sweeps
     report
     deploy
+    outside
+    pettingzoo
+    gymnasium
     cli
     __main__
 """.split()

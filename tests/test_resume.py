@@ -606,7 +606,7 @@ def test_runs_side_by_side_go_by_their_settings_and_faults_are_told_at_the_end(m
     run = Known
     groups = []
 
-    def fit(group, stop, attempts):
+    def fit(group, stop, attempts, log):
         groups.append([(r.trainer, r.seed) for r in group])
         for r in group:
             event = events.Progress(*r.named, {"steps": 8}, 1)

@@ -64,6 +64,8 @@ def test_an_event_file_is_records_of_every_line_and_begins_anew(about):
     first, *rest = messages(path)
     assert b"brain.Event:2" in first and len(rest) == 3
     assert b"\x10\x14" in rest[0] and b"J_Q\x15" + struct.pack("<f", 1.25) in rest[0]
+    content = path.read_bytes()
+    assert TensorBoard(about, LINES).path == path and path.read_bytes() == content
     assert TensorBoard(about, LINES[:1]).path == path and len(messages(path)) == 2
 
 

@@ -14,8 +14,7 @@ from marlyap.games.dynamics import SingleIntegrator
 from marlyap.learning.algorithms import ALGORITHMS, APG, MASAC
 from marlyap.learning.constraints import Lyapunov
 from marlyap.learning.traced import AbstractTraced, is_traced, program, with_arrays
-from marlyap.runs import fit as fitting
-from marlyap.runs.fit import advance, stacked
+from marlyap.learning.training import row, stack, stacked
 from marlyap.runs.run import begin
 from marlyap.tasks import Rendezvous
 
@@ -61,10 +60,10 @@ def test_a_path_says_whether_its_number_is_given():
 
 
 def trained(trainers, seed=3):
-    carry = fitting._stack([begin(t, seed) for t in trainers])
-    for _, after, _ in advance(stacked(trainers), carry):
+    carry = stack([begin(t, seed) for t in trainers])
+    for _, after, _ in stacked(trainers).advance(carry):
         carry = after
-    return [fitting._row(carry, i) for i in range(len(trainers))]
+    return [row(carry, i) for i in range(len(trainers))]
 
 
 @pytest.fixture

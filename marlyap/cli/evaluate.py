@@ -43,9 +43,14 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     prepare()
     from marlyap.cli import figures
     from marlyap.runs import groups
+    from marlyap.runs.hosted import outside
     from marlyap.runs.subject import refuse_all_but_task
     from marlyap.storage import store
 
+    if outside(args.runs):
+        from marlyap.cli import hosted
+
+        return hosted.evaluate(args, overrides)
     starts = starts_of(args.seed)
     refuse_all_but_task(overrides)
     harder = figures.Harder(args.horizon, args.starts_scale, args.push, args.jump)

@@ -35,9 +35,14 @@ def options(p: ArgumentParser) -> None:
 def run(args: Namespace, overrides: Overrides) -> Result:
     """Write the HTML page and the pictures."""
     prepare()
+    from marlyap.runs.hosted import outside
     from marlyap.runs.run import expand
     from marlyap.runs.subject import subject
 
+    if outside(args.runs):
+        from marlyap.cli import hosted
+
+        return hosted.report(args, overrides)
     opened = [subject(d, args.task, args.algorithm, overrides) for d in expand(args.runs)]
     runs, games = [run for run, _ in opened], [game for _, game in opened]
     default = runs[0].directory / "report.html" if len(runs) == 1 else Path("report.html")

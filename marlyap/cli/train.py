@@ -25,20 +25,28 @@ EXAMPLES = """
   marlyap train formation masac --seeds 0 1 2 --steps 100000 --task.agents 5
   marlyap train rendezvous masac --shield --shield.action residual
   marlyap train platoon.py:Platoon apg
-  marlyap train --resume runs/rendezvous/masac-lyapunov/seed0"""
+  marlyap train --resume runs/rendezvous/masac-lyapunov/seed0
+  marlyap train --resume runs/rendezvous/masac/seed0 --steps 500000
+  marlyap train rendezvous-rest masac --from runs/rendezvous/masac/seed0
+  marlyap train pettingzoo:mpe2.simple_spread_v3 masac --task.workers 2"""
 
 
 def options(p: ArgumentParser) -> None:
     p.add_argument("task", nargs="?", metavar="TASK", help=NAMED)
     p.add_argument("algorithm", nargs="?", metavar="ALGORITHM", help=NAMED)
     p.add_argument("--seeds", nargs="+", action=Once, help="training seeds (default 0)")
-    p.add_argument("--steps", type=number, help="environment steps of each seed")
+    p.add_argument(
+        "--steps", type=number, help="environment steps of each seed; with --resume a longer run"
+    )
     p.add_argument(
         "--out", type=place, default=None, help="directory (default runs/TASK/ALGORITHM)"
     )
     p.add_argument("--preset", help="tuned (default) or paper")
     p.add_argument("--force", action="store_true", help="overwrite runs that are there")
     p.add_argument("--resume", type=place, nargs="+", metavar="RUN", help="resume these runs")
+    p.add_argument(
+        "--from", type=place, dest="origin", metavar="RUN", help="begin with this run's networks"
+    )
     own = "where a resumed run's is your own code"
     p.add_argument("--task", dest="own_task", help=f"the task, {own}")
     p.add_argument("--algorithm", dest="own_algorithm", help=f"the algorithm, {own}")
@@ -58,7 +66,7 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     from marlyap.cli import training
 
     if args.resume:
-        given = {"--seeds": args.seeds, "--steps": args.steps, "--preset": args.preset}
+        given = {"--seeds": args.seeds, "--preset": args.preset, "--from": args.origin}
         given |= {"--out": args.out, "--force": args.force or None}
         given |= {"--shield": args.shield or None}
         given |= {f"--{path}": value for path, value in overrides.items()}
@@ -66,6 +74,7 @@ def run(args: Namespace, overrides: Overrides) -> Result:
             raise UserError(f"{option}: a resumed run keeps its settings; leave it out.")
         task, algorithm = args.task or args.own_task, args.algorithm or args.own_algorithm
         runs = training.reopened(args.resume, task, algorithm)
+        runs = [run.lengthened(args.steps) for run in runs] if args.steps is not None else runs
         how = replace(how, task=task, algorithm=algorithm)
     else:
         if args.own_task or args.own_algorithm:
@@ -75,6 +84,8 @@ def run(args: Namespace, overrides: Overrides) -> Result:
             raise UserError("train: name a task and an algorithm, as in train rendezvous masac.")
         asked = training.Asked(args.task, args.algorithm, args.preset, args.steps, args.shield)
         runs = training.create(asked, overrides, args.seeds or ["0"], args.out, args.force)
+        if args.origin is not None:
+            training.start_from(runs, args.origin, args.task, args.algorithm)
         how = replace(how, task=args.task, algorithm=args.algorithm)
     code = training.trained(runs, how, new=not args.resume)
     state = [

@@ -60,8 +60,13 @@ def run(args: Namespace, overrides: Overrides) -> Result:
     from marlyap.report.gif import films_gif
     from marlyap.report.mp4 import encoder, films_mp4
     from marlyap.report.page import html
+    from marlyap.runs.hosted import outside
     from marlyap.storage import store
 
+    if outside([args.run]):
+        from marlyap.cli import hosted
+
+        return hosted.watch(args, overrides)
     if "mp4" in args.format:
         encoder()
     if len(args.compare) >= MOST:

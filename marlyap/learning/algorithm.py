@@ -2,12 +2,13 @@
 
 import abc
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from marlyap.compute.devices import gathered
+from marlyap.errors import UserError
 from marlyap.learning.health import Health
 from marlyap.learning.replay import Episode
 from marlyap.learning.schedule import Schedule
@@ -75,8 +76,26 @@ class AbstractAlgorithm(AbstractTraced):
     ) -> tuple[PyTree, Info]:
         """Play and learn once, with all learning rates multiplied by `decay`."""
 
+    def from_steps(self) -> Any:
+        """Itself as an `AbstractOffPolicy`, for games outside JAX, of which single steps are kept.
+
+        Raises UserError where it needs more than that.
+        """
+        raise UserError(
+            "algorithm: it needs a game in JAX or whole episodes; for a game outside JAX take one "
+            "that learns from single steps, such as masac or maddpg."
+        )
+
     def networks(self, learner: PyTree) -> PyTree:
         """The networks of a learner; the default is all of it."""
+        return learner
+
+    def with_networks(self, learner: PyTree, networks: PyTree) -> PyTree:
+        """The learner with other networks in it."""
+        return networks
+
+    def with_room(self, learner: PyTree, like: PyTree) -> PyTree:
+        """The learner with as much room to remember as `like` has, for a longer run."""
         return learner
 
     @abc.abstractmethod

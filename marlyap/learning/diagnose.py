@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PyTree
 
-from marlyap.learning.trainer import Carry, Trainer
+from marlyap.learning.training import AbstractTrainer, Carry
 from marlyap.nets.nets import Actors
 
 
-def diagnose(trainer: Trainer, carry: Carry, iteration: int) -> str | None:
+def diagnose(trainer: AbstractTrainer, carry: Carry, iteration: int) -> str | None:
     """Replay from `carry` until an iteration past which an array of the learner is not finite.
 
     Says which array, in which update, and of which agent where the actors have their own; None if
@@ -27,13 +27,13 @@ def diagnose(trainer: Trainer, carry: Carry, iteration: int) -> str | None:
             column = int(np.argmax(table[update] >= 0))
             networks = trainer.algorithm.networks(carry.learner)
             path, leaf = _numbers(networks)[column]
-            who = _agent(networks, trainer.game.agents, path, leaf, int(table[update, column]))
+            who = _agent(networks, trainer.agents, path, leaf, int(table[update, column]))
             return f"{_words(path)}{who} in update {update + 1} of iteration {now}"
     return None
 
 
 @eqx.filter_jit(donate="all-except-first")
-def _watched(trainer: Trainer, carry: Carry) -> tuple[Carry, list[Int[Array, "update"]]]:
+def _watched(trainer: AbstractTrainer, carry: Carry) -> tuple[Carry, list[Int[Array, "update"]]]:
     after, info = trainer.iterate(carry, first_faults)
     return after, info.seen
 

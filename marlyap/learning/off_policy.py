@@ -8,9 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from marlyap.errors import UserError
 from marlyap.learning.algorithm import AbstractFromData, Log, Watch, unwatched
 from marlyap.learning.health import Health
-from marlyap.learning.replay import Replay
+from marlyap.learning.replay import AbstractMemory, Replay
+from marlyap.learning.source import CostWindow
 from marlyap.simulation.rollout import Uniform
 from marlyap.types import Key, Scalar, Transition
 
@@ -22,7 +24,7 @@ class Learner(eqx.Module):
     """What an off-policy algorithm carries from one iteration to the next."""
 
     networks: PyTree
-    memory: Replay
+    memory: AbstractMemory
 
 
 class AbstractOffPolicy(AbstractFromData):
@@ -41,6 +43,20 @@ class AbstractOffPolicy(AbstractFromData):
 
     def networks(self, learner):
         return learner.networks
+
+    def with_networks(self, learner, networks):
+        return Learner(networks, learner.memory)
+
+    def with_room(self, learner, like):
+        return Learner(learner.networks, learner.memory.resized(like.memory))
+
+    def from_steps(self):
+        if self.cost_window != CostWindow():
+            raise UserError(
+                "algorithm.constraint: it needs the costs of a game in JAX, and a game outside has "
+                "rewards alone; set it to none."
+            )
+        return self
 
     def updates_per_iteration(self, play):
         return play.schedule.updates(play.steps_per_iteration)
@@ -66,7 +82,7 @@ class AbstractOffPolicy(AbstractFromData):
     def improve(
         self,
         networks: PyTree,
-        memory: Replay,
+        memory: AbstractMemory,
         updates: int,
         key: Key,
         decay: Scalar,

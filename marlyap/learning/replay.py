@@ -4,12 +4,14 @@ Whole episodes are kept because next_obs of one step is obs of the following one
 memory), and because n-step returns need the steps that follow.
 """
 
+import abc
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from marlyap.types import Key, Scalar, Transition
 
@@ -33,7 +35,23 @@ class Episode(eqx.Module):
         return math.prod(self.terminated.shape)
 
 
-class Replay(eqx.Module):
+class AbstractMemory(eqx.Module):
+    """What may be drawn from: whole episodes, or single steps."""
+
+    @abc.abstractmethod
+    def add(self, new: Any) -> Any:
+        """With what was just played; the oldest is overwritten."""
+
+    @abc.abstractmethod
+    def sample(self, key: Key, batch: int, gamma: Scalar | float, n: int = 1) -> Transition:
+        """`batch` transitions with n-step rewards, each step equally likely."""
+
+    @abc.abstractmethod
+    def resized(self, like: Any) -> Any:
+        """The newest of it in as many rows as `like` has, which holds arrays or their shapes."""
+
+
+class Replay(AbstractMemory):
     """The last `rows` episodes."""
 
     episodes: Episode  # every leaf has a leading axis `rows`
@@ -73,6 +91,9 @@ class Replay(eqx.Module):
         take = lambda row, t, noise: self.transition(row, t, noise, gamma, n)
         return jax.vmap(take)(row, t, noise)
 
+    def resized(self, like: "Replay") -> "Replay":
+        return Replay(*regrown(self.episodes, like.episodes, self.head, self.size))
+
     def transition(
         self,
         row: Int[Array, ""],
@@ -106,3 +127,14 @@ class Replay(eqx.Module):
             cost_ahead=e.cost_ahead[row, t],
             noise=noise,
         )
+
+
+def regrown(
+    kept: PyTree, like: PyTree, head: Int[Array, ""], size: Int[Array, ""]
+) -> tuple[PyTree, Int[Array, ""], Int[Array, ""]]:
+    """The newest rows of a ring, in order, in a ring of another length; its head and size."""
+    old, new = (jax.tree.leaves(tree)[0].shape[0] for tree in (kept, like))
+    count = min(int(size), new)
+    order = (int(head) - count + jnp.arange(count)) % old
+    put = lambda x: jnp.zeros((new, *x.shape[1:]), x.dtype).at[:count].set(x[order])
+    return jax.tree.map(put, kept), jnp.asarray(count % new), jnp.asarray(count)

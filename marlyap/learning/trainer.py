@@ -1,33 +1,30 @@
 """The outer loop of Algorithms 1 and 2, compiled an iteration at a time."""
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, PyTree
+import numpy as np
 
+from marlyap.compute import devices, export_cache
 from marlyap.compute.devices import shard
 from marlyap.games.game import AbstractGame
 from marlyap.learning.algorithm import AbstractAlgorithm, Info, KeyPair, Watch, unwatched
+from marlyap.learning.diagnose import diagnose
 from marlyap.learning.health import Health
 from marlyap.learning.schedule import SCHEDULES, Schedule
-from marlyap.learning.source import Play, Simulated
+from marlyap.learning.source import Play, Simulated, shape
+from marlyap.learning.traced import with_arrays
+from marlyap.learning.training import AbstractTrainer, Carry as Carry, Told
 from marlyap.seeds import stream
 from marlyap.simulation.evaluation import outcomes
-from marlyap.simulation.rollout import Decentralised, Policy
+from marlyap.simulation.rollout import Decentralised
 from marlyap.types import Key, Scalar
 
 
-class Carry(eqx.Module):
-    """All that training is at one instant; saved whole, so that a resumed run is the same run."""
-
-    learner: PyTree  # the algorithm's
-    key: Key
-    iteration: Int[Array, ""]
-    best: Policy  # of those evaluated, the one with the highest score
-    score: Scalar
-
-
-class Trainer(eqx.Module):
+class Trainer(AbstractTrainer):
     """One training run as two pure functions, `begin` and `iterate`."""
 
     game: AbstractGame
@@ -38,6 +35,10 @@ class Trainer(eqx.Module):
         self.algorithm.fits(self.game.agents)
 
     @property
+    def shape(self):
+        return shape(self.game)
+
+    @property
     def play(self) -> Play:
         """What the algorithm is given to learn from."""
         return Play(Simulated(self.game), self.schedule)
@@ -45,10 +46,6 @@ class Trainer(eqx.Module):
     @property
     def steps_per_iteration(self) -> int:
         return self.play.steps_per_iteration
-
-    @property
-    def iterations(self) -> int:
-        return self.play.iterations
 
     @property
     def updates_per_iteration(self) -> int:
@@ -93,11 +90,53 @@ class Trainer(eqx.Module):
         look = {"success": rate(seen.success), "distance": jnp.mean(seen.final)}
         return carry, look | {"speed": jnp.mean(seen.speed), "spin": jnp.mean(seen.spin)}
 
-    def decay(self, iteration: Int[Array, ""]) -> Scalar:
-        """What the learning rates are multiplied by."""
-        s = self.schedule
-        span = s.decay_episodes or self.iterations * s.environments
-        return s.decay ** (iteration * s.environments / span)
+    def advance(self, carry, stop=lambda: False):
+        done, mesh = int(np.min(carry.iteration)), devices.mesh_for(carry.iteration.size)
+        carry = devices.placed(carry, carry.iteration.ndim > 0, mesh)
+        given = with_arrays(self)
+        compiled = lambda f: export_cache.compiled(f, given, carry, lambda: carry, donate=True)
+        iterate = select = None
+        while done < self.iterations and not stop():
+            done += 1
+            with devices.using(mesh):
+                iterate = iterate or compiled(_iterate)
+                carry, info = iterate(carry)
+                log, health = info["log"], info["health"]
+                if done % self.schedule.select_every == 0 or done == self.iterations:
+                    select = select or compiled(_select_best)
+                    carry, look = select(carry)
+                    log |= look
+            yield done, carry, Told(*jax.tree.map(np.atleast_1d, (log, Health(**health))))
+
+    def model(self):
+        return self.game
+
+    def diagnose(self, carry, iteration):
+        return diagnose(self, carry, iteration)
+
+
+def _each(
+    f: Callable[[Trainer, Carry], tuple[Carry, dict[str, Any]]], trainer: Trainer, carry: Carry
+) -> tuple[Carry, dict[str, Any]]:
+    """`f` for every run: vmapped only when there are several, since a batch of one costs speed."""
+    several = carry.iteration.ndim > 0
+    own = lambda x: 0 if eqx.is_array(x) and x.ndim else None  # a run's own, or that of all
+    axes: dict[str, Any] = {"in_axes": (own, eqx.if_array(0)), "spmd_axis_name": devices.RUNS}
+    each = eqx.filter_vmap(f, **axes) if several else f
+    after, info = each(trainer, carry)
+    return devices.kept(after, several), info
+
+
+def _iterate(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
+    def told(trainer, carry):
+        after, info = trainer.iterate(carry)
+        return after, {"log": info.log, "health": info.health._asdict()}
+
+    return _each(told, trainer, carry)
+
+
+def _select_best(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
+    return _each(lambda trainer, carry: trainer.select_best(carry), trainer, carry)
 
 
 def schedule_for(algorithm: AbstractAlgorithm, preset: str = "tuned") -> Schedule:

@@ -21,6 +21,7 @@ class Shape(NamedTuple):
     errors: int  # how many leading features are zero exactly on the target set
     du: int
     kinds: tuple[int, ...] = ()  # of each agent: those of one kind may share weights; (): all alike
+    inputs: tuple[int, ...] = ()  # of each agent: the first so many of du actions count; (): all
 
 
 EPS = 1e-5  # of LayerNorm
@@ -99,7 +100,7 @@ class Actors(eqx.Module):
 
     net: MLP  # leaves have a leading axis `agent`, or `kind`; none where all share
     shared: bool | tuple[int, ...]  # the kind of each agent where those of one kind share
-    du: int
+    du: int | tuple[int, ...]  # actions of every agent, or of each: those beyond them are 0
 
     def __init__(self, shape: Shape, width: int, shared: bool = False, *, key: Key):
         make = lambda k: MLP((shape.obs, width, width, 2 * shape.du), key=k)
@@ -109,7 +110,7 @@ class Actors(eqx.Module):
             self.net = several(1 + max(self.shared))
         else:
             self.net = make(key) if shared else several(shape.agents)
-        self.du = shape.du
+        self.du = shape.inputs or shape.du
 
     @property
     def each(self) -> MLP:
@@ -122,29 +123,55 @@ class Actors(eqx.Module):
         """tanh(mean + std * noise) for standard normal noise: reparametrised."""
         per_agent = _squashed_rows if self.shared is True else eqx.filter_vmap(_squashed)
         column = lambda x: x[..., None]
-        out = per_agent(self.each, (column(obs), column(noise), column(memory)))
+        masks = (column(mask),) if (mask := self.mask) is not None else ()
+        out = per_agent(self.each, (column(obs), column(noise), column(memory), *masks))
         return Sample(out[0][..., 0], out[1][..., 0, 0], out[2][..., 0, 0])
 
     def mode(self, obs: Obs) -> Action:
         """The deterministic policy that is evaluated, certified and deployed."""
         per_agent = _apply_to_rows if self.shared is True else eqx.filter_vmap(_apply)
-        return jnp.tanh(jnp.split(per_agent(self.each, obs[..., None])[..., 0], 2, axis=-1)[0])
+        mean = jnp.split(per_agent(self.each, obs[..., None])[..., 0], 2, axis=-1)[0]
+        return self.within(jnp.tanh(mean))
+
+    @property
+    def width(self) -> int:
+        """Actions in a row: of the agent that has most."""
+        return self.du if isinstance(self.du, int) else max(self.du)
+
+    @property
+    def mask(self) -> Action | None:
+        """1 where an action counts, 0 where it is there because another agent has more."""
+        if isinstance(self.du, int):
+            return None
+        return jnp.asarray([[float(k < n) for k in range(self.width)] for n in self.du])
+
+    def within(self, action: Action) -> Action:
+        """The same, 0 where it does not count."""
+        return action if (mask := self.mask) is None else action * mask
 
 
-def _squash(net: MLP, x: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-    """(obs, noise, memory) [*stack, ., batch] -> (action, log pi of it, log pi of memory)."""
-    obs, noise, memory = x
+def _squash(net: MLP, x: tuple[Array, ...]) -> tuple[Array, Array, Array]:
+    """(obs, noise, memory) [*stack, ., batch] -> (action, log pi of it, log pi of memory).
+
+    A fourth array says which actions count; the others are 0 and have no part in log pi.
+    """
+    obs, noise, memory, *masks = x
+    counted = lambda y: y * masks[0] if masks else y
     mean, log_std = jnp.split(_forward(net, obs), 2, axis=-2)
     log_std = jnp.clip(log_std, -5.0, 2.0)
 
     def log_prob(u, z):
         log_normal = -0.5 * z**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
         log_squash = 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))  # log(1 - tanh(u)^2)
-        return total(log_normal - log_squash)
+        return total(counted(log_normal - log_squash))
 
     u = mean + jnp.exp(log_std) * noise
     past = jnp.arctanh(jnp.clip(memory, -1 + 1e-6, 1 - 1e-6))
-    return jnp.tanh(u), log_prob(u, noise), log_prob(past, (past - mean) * jnp.exp(-log_std))
+    return (
+        counted(jnp.tanh(u)),
+        log_prob(u, noise),
+        log_prob(past, (past - mean) * jnp.exp(-log_std)),
+    )
 
 
 _squashed = batch_last(_squash)
@@ -157,7 +184,7 @@ class Sampled(AbstractExplorer):
     pi: Actors
 
     def __call__(self, obs: Obs, key: Key) -> Action:
-        noise = jax.random.normal(key, (obs.shape[0], self.pi.du))
+        noise = jax.random.normal(key, (obs.shape[0], self.pi.width))
         return self.pi.sample(obs, noise, noise).action
 
     def log_prob(self, obs: Obs, action: Action) -> Float[Array, "agent"]:

@@ -10,7 +10,6 @@ from marlyap.errors import UserError
 from marlyap.report import plot
 from marlyap.report.charts import mean_curve
 from marlyap.report.scene import SOFT, ink
-from marlyap.runs.run import Run
 from marlyap.sweeps import table
 from marlyap.sweeps.folder import Sweep
 
@@ -36,20 +35,6 @@ def plot_sweep(sweep: Sweep, metric: str = "success") -> Figure:
     for (cell, _), points in found.items():
         x, y = np.array(points).T
         groups[label[cell] or "all"].append((x, y))
-    return _drawn(groups, metric)
-
-
-def plot_runs(runs: Sequence[Run], metric: str = "success") -> Figure:
-    """A metric of the logs of runs: a thin line a run, and the mean of those of one configuration.
-
-    As `plot_sweep`.
-    """
-    groups: dict[str, list[Curve]] = defaultdict(list)
-    for run in runs:
-        lines = [line for line in run.history() if metric in line]
-        if lines:
-            x, y = np.array([(line["steps"], line[metric]) for line in lines]).T
-            groups[run.title.rpartition(" seed ")[0]].append((x, y))
     return _drawn(groups, metric)
 
 

@@ -8,12 +8,11 @@ import numpy as np
 from marlyap.controllers import CONTROLLERS
 from marlyap.games.game import AbstractGame
 from marlyap.report.data import Film
-from marlyap.report.episodes import driven, one
+from marlyap.report.episodes import costs, driven, one
 from marlyap.runs import config
 from marlyap.runs.bench import suited
 from marlyap.runs.groups import Measured, same_game
 from marlyap.runs.run import Run
-from marlyap.simulation.evaluation import evaluate
 
 
 NONE = "none"  # said by a user who wants no reference
@@ -90,8 +89,8 @@ def reference(game: AbstractGame, starts: int) -> str | None:
     names = [name for name in suited(game) if name not in FLOOR]
     if len(names) < 2:
         return next(iter(names), None)
-    cost = lambda name: evaluate(game, CONTROLLERS[name](game), TRIED, starts, beyond=0).cost.mean()
-    return min(names, key=cost)
+    mean = lambda name: costs(game, CONTROLLERS[name](game), starts, TRIED).mean()
+    return min(names, key=lambda name: np.nan_to_num(mean(name), nan=np.inf))
 
 
 def _size(film: Film) -> int:

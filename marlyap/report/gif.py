@@ -49,6 +49,17 @@ def film_pair_gif(left: Film, right: Film, path: str | Path, fps: float | int = 
     films_gif([left, right], path, fps)
 
 
+def frames_gif(frames: Sequence[np.ndarray], path: str | Path, fps: float | int = 10) -> None:
+    """Frames [height width 3] that were drawn elsewhere, thinned out to MOST_FRAMES.
+
+    Raises UserError if the file cannot be written.
+    """
+    images = [Image.fromarray(np.ascontiguousarray(f)) for f in frames]
+    images = images[:: -(-len(images) // MOST_FRAMES)]
+    more = {"append_images": images[1:], "duration": int(1000 / fps), "loop": 0}
+    write_bytes_atomic(Path(path), lambda f: images[0].save(f, "GIF", save_all=True, **more))
+
+
 def films_gif(
     films: Sequence[Film],
     path: str | Path,

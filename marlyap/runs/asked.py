@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from marlyap.errors import UserError
-from marlyap.games.game import AbstractGame
 from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.algorithms import PRESETS
-from marlyap.learning.trainer import Trainer, schedule_for
+from marlyap.learning.trainers import ready, trainer_for, usual_schedule
+from marlyap.learning.training import AbstractTrainer
 from marlyap.runs import config
 from marlyap.runs.subject import unfolded
 from marlyap.shields import behind
@@ -34,9 +34,10 @@ class Asked:
         }
 
 
-def assemble(asked: Asked, overrides: Mapping[str, str]) -> Trainer:
+def assemble(asked: Asked, overrides: Mapping[str, str]) -> AbstractTrainer:
     """Task, algorithm and schedule as asked for."""
-    return Trainer(**parts(asked, overrides))
+    made = parts(asked, overrides)
+    return trainer_for(made["game"], made["algorithm"], made["schedule"])
 
 
 def parts(asked: Asked, overrides: Mapping[str, str]) -> dict[str, Any]:
@@ -44,13 +45,13 @@ def parts(asked: Asked, overrides: Mapping[str, str]) -> dict[str, Any]:
     preset = asked.names["preset"]
     if preset not in PRESETS:
         raise UserError(f"preset: '{preset}' is unknown; {config.suggest(preset, PRESETS)}")
-    game = config.load(asked.task, AbstractGame)
+    game = config.load_task(asked.task)
     algorithm = PRESETS[preset](config.load(asked.algorithm, AbstractAlgorithm))
-    schedule = schedule_for(algorithm, preset)
+    schedule = usual_schedule(game, algorithm, preset)
     made = unfolded(game, asked.shield, overrides)
     made |= {"algorithm": algorithm, "schedule": schedule}
     made = config.override_all(made, overrides)
     if asked.steps is not None:
         made["schedule"] = config.override(made["schedule"], "steps", str(asked.steps))
-    game = behind(made["task"], made.get("shield"))
+    game = ready(behind(made["task"], made.get("shield")))
     return {"game": game, "algorithm": made["algorithm"], "schedule": made["schedule"]}

@@ -15,7 +15,7 @@ import types
 import typing
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from functools import cache
+from functools import cache, singledispatch
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -25,10 +25,12 @@ from marlyap.controllers import CONTROLLERS, AbstractController
 from marlyap.errors import UserError, first_line, raised_at, whole
 from marlyap.games.dynamics import DYNAMICS, AbstractDynamics
 from marlyap.games.game import AbstractGame
+from marlyap.hosts.sources import is_file, names_a_host
 from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.algorithms import ALGORITHMS
 from marlyap.learning.constraint import AbstractConstraint
 from marlyap.learning.constraints import CONSTRAINTS
+from marlyap.learning.hosted import Hosted
 from marlyap.learning.schedule import Schedule
 from marlyap.shields import Shield, Shielded
 from marlyap.tasks import TASKS
@@ -58,9 +60,9 @@ class NotOfThatKind(UserError):
 def known() -> dict[str, type]:
     """The classes that a record may name without anyone's leave."""
     members = [o for family in FAMILIES.values() for o in family.values()]
-    return {cls.__name__: cls for o in members for cls in classes_in(o)} | {
-        cls.__name__: cls for cls in (Schedule, Shield, Shielded)
-    }
+    found = {cls.__name__: cls for o in members for cls in classes_in(o)}
+    more = (Schedule, Hosted, Shield, Shielded)
+    return found | {cls.__name__: cls for cls in more}
 
 
 def suggest(word: str, among: Iterable[str]) -> str:
@@ -72,6 +74,21 @@ def suggest(word: str, among: Iterable[str]) -> str:
     if len(names) > MOST_NAMES:
         return f"there are {len(names)}, which `marlyap list` shows."
     return f"there is {', '.join(names) or 'none'}."
+
+
+def load_task(name: str) -> AbstractGame | Hosted:
+    """The task called `name`: a game of JAX as `load` has it, or one that is played outside.
+
+    path/to/file.py:make is outside where it names a function. A file is executed: name your own.
+    """
+    if names_a_host(name):
+        return Hosted(name)
+    path, _, attribute = name.rpartition(":")
+    if path and Path(path).is_file():
+        made = getattr(_module(Path(path), "task"), attribute, None)
+        if callable(made) and not inspect.isclass(made) and not isinstance(made, AbstractGame):
+            return Hosted(name)
+    return load(name, AbstractGame)
 
 
 def load(name: str, family: type[T]) -> T:
@@ -232,13 +249,25 @@ def code_of(obj: Any, typed: str) -> dict[str, Any] | None:
     `typed` is what the object was called: `file` is the file as it was typed there, `source` where
     it lies.
     """
-    used = own_classes(obj)
-    if not used:
+    used, path = own_classes(obj), _maker_of(obj)
+    if not used and path is None:
         return None
-    path = _file(next(iter(used.values())))
+    path = path or _file(next(iter(used.values())))
     file = typed.rpartition(":")[0] or (path.name if path else None)
     digest = hashlib.sha256(path.read_bytes()).hexdigest() if path else None
     return {"file": file, "sha256": digest, "classes": list(used), "source": path}
+
+
+@singledispatch
+def _maker_of(obj: Any) -> Path | None:
+    """The user's file with the function that makes this object's environments, if there is one."""
+    return None
+
+
+@_maker_of.register
+def _(obj: Hosted) -> Path | None:
+    path = Path(obj.source.rpartition(":")[0])
+    return path if is_file(obj.source) and path.is_file() else None
 
 
 def _ours(cls: type) -> bool:

@@ -10,20 +10,17 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from marlyap.compute import devices, export_cache
 from marlyap.compute.cache import enable_cache
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
 from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.algorithms import ALGORITHMS
-from marlyap.learning.diagnose import diagnose
 from marlyap.learning.health import Health, TaskFault
 from marlyap.learning.schedule import Schedule
-from marlyap.learning.traced import with_arrays
-from marlyap.learning.trainer import Carry, Trainer, schedule_for
+from marlyap.learning.trainer import Trainer, schedule_for
+from marlyap.learning.training import AbstractTrainer, Carry, row, stack, stacked
 from marlyap.nets.nets import LyapunovNet, NormNet
 from marlyap.runs import config, events
 from marlyap.runs.progress import show
@@ -124,18 +121,18 @@ def _together(
     faults: dict[int, Diverged] = {}
     runs, trainer = [one.run for one in loaded], loaded[0].run.trainer
     given = stacked([run.trainer for run in runs])
-    first = carry = _stack([one.carry for one in loaded])
+    first = carry = stack([one.carry for one in loaded])
     before, clock = max(one.seconds for one in loaded), time.monotonic()
     saved, alive = _Saved(clock), [True] * len(runs)
 
-    for done, carry, told in advance(given, first, stop):
+    for done, carry, told in given.advance(first, stop):
         seconds = before + time.monotonic() - clock
         for i, run in enumerate(runs):
             line = _line(trainer, run.seed, done, seconds, told.log, i)
-            fault = _fault(line, told.health_of(i), trainer.game.agents)
+            fault = _fault(line, told.health_of(i), trainer.agents)
             if fault and alive[i]:
                 alive[i] = False
-                where = None if fault.by_task else diagnose(run.trainer, run.load()[0], done)
+                where = None if fault.by_task else run.trainer.diagnose(run.load()[0], done)
                 says = f"{fault.says(where)} in {run.directory}."
                 faults[run.seed] = Diverged(says)
                 yield events.Diverged(*run.named, done, fault.name, says)
@@ -148,42 +145,6 @@ def _together(
             yield from saved.save(runs, carry, alive, seconds)
     yield from saved.save(runs, carry, alive, before + time.monotonic() - clock)
     return faults
-
-
-class Told(NamedTuple):
-    """What an iteration tells of every run: the arrays have a leading axis of runs."""
-
-    log: dict[str, np.ndarray]
-    health: Health
-
-    def health_of(self, i: int) -> Health:
-        return Health(*[at[i] for at in self.health])
-
-
-def advance(
-    trainer: Trainer, carry: Carry, stop: Callable[[], bool] = lambda: False
-) -> Iterator[tuple[int, Carry, Told]]:
-    """Iterate to the end or until `stop()`; yields (iterations done, carry, what it tells).
-
-    The arrays of `carry` have a leading axis of runs where there are several, and so may those of
-    `trainer` (`stacked`); those of `Told` always have it. The carry that goes in is used up.
-    """
-    done, mesh = int(np.min(carry.iteration)), devices.mesh_for(carry.iteration.size)
-    carry = devices.placed(carry, carry.iteration.ndim > 0, mesh)
-    given = with_arrays(trainer)
-    compiled = lambda f: export_cache.compiled(f, given, carry, lambda: carry, donate=True)
-    iterate = select = None
-    while done < trainer.iterations and not stop():
-        done += 1
-        with devices.using(mesh):
-            iterate = iterate or compiled(_iterate)
-            carry, info = iterate(carry)
-            log, health = info["log"], info["health"]
-            if done % trainer.schedule.select_every == 0 or done == trainer.iterations:
-                select = select or compiled(_select_best)
-                carry, look = select(carry)
-                log |= look
-        yield done, carry, Told(*jax.tree.map(np.atleast_1d, (log, Health(**health))))
 
 
 @dataclass(frozen=True)
@@ -255,8 +216,8 @@ def train(
     def happening() -> Iterator[events.Event]:
         yield events.Started("", seed)
         clock = time.monotonic()
-        first = _stack([begin(trainer, seed)])
-        for done, carry, told in advance(trainer, first):
+        first = stack([begin(trainer, seed)])
+        for done, carry, told in trainer.advance(first):
             last[:] = [carry]
             line = _line(trainer, seed, done, time.monotonic() - clock, told.log, 0)
             if fault := _fault(line, told.health_of(0), game.agents):
@@ -271,7 +232,7 @@ def train(
     else:
         for _ in happening():
             pass
-    carry = _row(last[0], 0)
+    carry = row(last[0], 0)
     lyapunov = algorithm.lyapunov(algorithm.networks(carry.learner))
     return Trained(carry.best, lyapunov, game, history, trainer, seed, carry)
 
@@ -291,78 +252,20 @@ class _Saved:
         """A checkpoint of every run that is alive; returns what to tell of it."""
         start, sound = time.monotonic(), [i for i, well in enumerate(alive) if well]
         for i in sound:
-            runs[i].save(_row(carry, i), seconds)
+            runs[i].save(row(carry, i), seconds)
         self.at = time.monotonic()
         self.cost = self.at - start
         done = int(np.min(carry.iteration))
         return [events.Saved(*runs[i].named, done) for i in sound]
 
 
-def _stack(carries: list[Carry]) -> Carry:
-    """A leading axis for several runs; one alone stays as it is, or XLA would copy its memory.
-
-    The carries are used up: with several runs nobody keeps their replay memories twice.
-    """
-    if len(carries) == 1:
-        return carries[0]
-
-    def join(*xs):
-        if not eqx.is_array(xs[0]):
-            return xs[0]
-        joined = jnp.stack(xs)
-        for x in xs:
-            x.delete()
-        return joined
-
-    return jax.tree.map(join, *carries)
-
-
-def _row(carry: Carry, i: int) -> Carry:
-    if carry.iteration.ndim == 0:
-        return carry
-    return jax.tree.map(lambda x: x[i] if eqx.is_array(x) else x, carry)
-
-
-def stacked(trainers: list[Trainer]) -> Trainer:
-    """One trainer for several runs: the numbers that differ between them have a leading axis.
-
-    Raises UserError if they differ in more than the numbers that a program is given.
-    """
-    given = [with_arrays(trainer) for trainer in trainers]
-    free = [eqx.filter(trainer, eqx.is_array, inverse=True) for trainer in given]
-    if any(other != free[0] for other in free):
-        raise UserError("runs: they differ in more than numbers; train them in processes.")
-    if all(trainer == trainers[0] for trainer in trainers):
-        return given[0]
-    return jax.tree.map(lambda *xs: jnp.stack(xs) if eqx.is_array(xs[0]) else xs[0], *given)
-
-
-def _each(
-    f: Callable[[Trainer, Carry], tuple[Carry, dict[str, Any]]], trainer: Trainer, carry: Carry
-) -> tuple[Carry, dict[str, Any]]:
-    """`f` for every run: vmapped only when there are several, since a batch of one costs speed."""
-    several = carry.iteration.ndim > 0
-    own = lambda x: 0 if eqx.is_array(x) and x.ndim else None  # a run's own, or that of all
-    axes: dict[str, Any] = {"in_axes": (own, eqx.if_array(0)), "spmd_axis_name": devices.RUNS}
-    each = eqx.filter_vmap(f, **axes) if several else f
-    after, info = each(trainer, carry)
-    return devices.kept(after, several), info
-
-
-def _iterate(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
-    def told(trainer, carry):
-        after, info = trainer.iterate(carry)
-        return after, {"log": info.log, "health": info.health._asdict()}
-
-    return _each(told, trainer, carry)
-
-
-def _select_best(trainer: Trainer, carry: Carry) -> tuple[Carry, dict[str, Any]]:
-    return _each(lambda trainer, carry: trainer.select_best(carry), trainer, carry)
-
-
 def _line(
-    trainer: Trainer, seed: int, done: int, seconds: float, log: dict[str, np.ndarray], i: int
+    trainer: AbstractTrainer,
+    seed: int,
+    done: int,
+    seconds: float,
+    log: dict[str, np.ndarray],
+    i: int,
 ) -> dict[str, Any]:
     """One line of the log."""
     return {

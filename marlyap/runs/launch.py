@@ -1,6 +1,7 @@
 """Many trainings at once: one process a core on a CPU, one vmapped program on a GPU."""
 
 import dataclasses
+import itertools
 import os
 import subprocess
 import sys
@@ -14,7 +15,6 @@ from typing import IO, Any
 import jax
 
 from marlyap.errors import UserError
-from marlyap.games.game import AbstractGame
 from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.traced import program
 from marlyap.runs import config, events
@@ -67,9 +67,11 @@ def together(runs: list[Run], how: Launch, stop: Callable[[], bool]) -> Iterator
     """
     failed: list[str] = []
     while runs:
-        what = program(runs[0].trainer)
-        group = [run for run in runs if program(run.trainer) == what]
-        runs = [run for run in runs if program(run.trainer) != what]
+        first, *others = runs
+        what, apart = program(first.trainer), not first.trainer.side_by_side
+        alike = [program(run.trainer) == what and not apart for run in others]
+        group = [first, *itertools.compress(others, alike)]
+        runs = [run for run, same in zip(others, alike, strict=True) if not same]
         says: dict[str, str] = {}
         try:
             for event in fit(group, stop, how.tries, how.log):
@@ -181,21 +183,17 @@ def _processes(runs: list[Run], how: Launch, stop: Callable[[], bool]) -> Iterat
         raise UserError(failed[0])
 
 
-FAMILIES: dict[str, type[Any]] = {"task": AbstractGame, "algorithm": AbstractAlgorithm}
-
-
 def reopened(job: Job) -> Run:
     """The run of a job, with the user's own code loaded where it needs some."""
-    names = {"task": job.how.task, "algorithm": job.how.algorithm}
-    game, algorithm = (
-        config.load(name, FAMILIES[part]) if name else None for part, name in names.items()
-    )
+    game = config.load_task(job.how.task) if job.how.task else None
+    named = job.how.algorithm
+    algorithm = config.load(named, AbstractAlgorithm) if named else None
     return Run.open(job.run, game, algorithm)
 
 
 def _with_code(run: Run, how: Launch) -> Launch:
     """`how`, with the place of the user's code in this run for a process that must load it."""
-    parts = {"task": run.game, "algorithm": run.trainer.algorithm}
+    parts = {"task": run.trainer.game, "algorithm": run.trainer.algorithm}
     named = {"task": how.task, "algorithm": how.algorithm}
     found = {
         part: _place_of(obj, part, [named[part] or "", run.names.get(part, "")])

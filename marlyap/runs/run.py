@@ -7,12 +7,14 @@ checkpoints/    the whole learner, replay memory and random keys included; the l
 policy/         the best policy so far, and the Lyapunov function: what is evaluated and deployed
 """
 
+import dataclasses
 import json
 import shutil
 import time
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import singledispatch
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +29,15 @@ from marlyap.compute import export_cache
 from marlyap.conformance import shapes
 from marlyap.errors import UserError, defined_at
 from marlyap.games.game import AbstractGame
+from marlyap.hosts.sources import is_file, names_a_host
 from marlyap.learning.algorithm import AbstractAlgorithm
 from marlyap.learning.health import Health
+from marlyap.learning.hosted import Hosted, HostPolicy
 from marlyap.learning.schedule import Schedule
 from marlyap.learning.source import shape
 from marlyap.learning.traced import with_arrays
-from marlyap.learning.trainer import Carry, Trainer
+from marlyap.learning.trainers import trainer_for
+from marlyap.learning.training import AbstractTrainer, Carry
 from marlyap.nets.nets import LyapunovNet, NormNet
 from marlyap.runs import config
 from marlyap.runs.curves import columns, framed
@@ -49,7 +54,7 @@ class Run:
     """One training run on disk. Make it with `create` or `open`."""
 
     directory: Path
-    trainer: Trainer
+    trainer: AbstractTrainer
     seed: int
     names: dict[str, str]  # what the task and the algorithm were called
     warnings: tuple[str, ...] = ()  # what to tell whoever opens it
@@ -58,7 +63,7 @@ class Run:
     def create(
         cls,
         directory: Path | str,
-        trainer: Trainer,
+        trainer: AbstractTrainer,
         seed: int,
         names: dict[str, str],
         force: bool = False,
@@ -131,7 +136,7 @@ class Run:
     def open(
         cls,
         directory: Path | str,
-        game: AbstractGame | None = None,
+        game: AbstractGame | Hosted | None = None,
         algorithm: AbstractAlgorithm | None = None,
     ) -> "Run":
         """A run that exists; pass the task or algorithm if it is code of your own.
@@ -176,10 +181,12 @@ class Run:
                 what = f"the code in {now['source']} is not what {directory} was trained with"
                 warnings.append(f"{part}: {what}; it has changed since.")
             parts.append(made)
-        for part, family in zip(parts, (AbstractGame, AbstractAlgorithm, Schedule), strict=True):
+        families = (AbstractGame | Hosted, AbstractAlgorithm, Schedule)
+        for part, family in zip(parts, families, strict=True):
             if not isinstance(part, family):
                 raise UserError(f"run: {where} has a {type(part).__name__} in the wrong place.")
-        return cls(directory, Trainer(*parts), about["seed"], names, tuple(warnings))
+        permitted(parts[0], game)
+        return cls(directory, trainer_for(*parts), about["seed"], names, tuple(warnings))
 
     @property
     def untouched(self) -> bool:
@@ -189,7 +196,8 @@ class Run:
 
     @property
     def game(self) -> AbstractGame:
-        return self.trainer.game
+        """In JAX. Raises UserError where it is played outside."""
+        return self.trainer.model()
 
     @property
     def named(self) -> tuple[str, int]:
@@ -199,7 +207,8 @@ class Run:
     @property
     def labels(self) -> dict[str, str]:
         """`names` to be shown: of path/to/file.py:Name the Name alone."""
-        return {part: name.rpartition(":")[2] for part, name in self.names.items()}
+        short = lambda name: name if names_a_host(name) else name.rpartition(":")[2]
+        return {part: short(name) for part, name in self.names.items()}
 
     @property
     def title(self) -> str:
@@ -235,7 +244,46 @@ class Run:
         saved = self.checkpoints.latest()
         like, _ = eqx.filter_eval_shape(self.trainer.begin, jax.random.key(0))
         carry = unflatten(like, saved.arrays, str(self.directory))
-        return carry, float(saved.meta.get("seconds", 0.0)), saved.warnings
+        warnings = (*saved.warnings, *self.trainer.resumed())
+        return carry, float(saved.meta.get("seconds", 0.0)), warnings
+
+    def lengthened(self, steps: int) -> "Run":
+        """The same run with a schedule of so many environment steps, to be resumed.
+
+        From here on the learning rates are those of the longer schedule at this place.
+        Raises UserError if it is not longer than what has been done.
+        """
+        if steps <= self.steps_done:
+            raise UserError(
+                f"steps: {self.directory} has done {self.steps_done} already; take more."
+            )
+        schedule = dataclasses.replace(self.trainer.schedule, steps=steps)
+        longer = dataclasses.replace(self.trainer, schedule=schedule)
+        with store.lock(self.directory):
+            if self.checkpoints.steps():
+                carry, seconds, _ = self.load()
+                like, _ = eqx.filter_eval_shape(longer.begin, jax.random.key(0))
+                learner = longer.algorithm.with_room(carry.learner, like.learner)
+                carry = eqx.tree_at(lambda c: c.learner, carry, learner)
+                saved = {"seconds": seconds}
+                self.checkpoints.save(int(carry.iteration), flatten(carry), saved)
+            about = store.read_json(self.directory / "run.json")
+            about["schedule"] = config.record(schedule)
+            text = json.dumps(about, indent=1) + "\n"
+            store.write_text_atomic(self.directory / "run.json", text)
+        return dataclasses.replace(self, trainer=longer)
+
+    def started_from(self, other: "Run") -> None:
+        """Begin with the networks of another run, their optimisers and its policy; memory is fresh.
+
+        Raises UserError where they do not fit.
+        """
+        a, carry = self.trainer.algorithm, begin(self.trainer, self.seed)
+        learnt = other.trainer.algorithm.networks(other.load()[0].learner)
+        networks = unflatten(a.networks(carry.learner), flatten(learnt), str(other.directory))
+        learner = a.with_networks(carry.learner, networks)
+        where = lambda c: (c.learner, c.best)
+        self.save(eqx.tree_at(where, carry, (learner, a.policy(networks))), 0.0)
 
     def deployed(self) -> tuple[Policy, LyapunovNet | NormNet | None]:
         """The policy that this run deploys, and its Lyapunov function if it has one."""
@@ -246,7 +294,7 @@ class Run:
         a = self.trainer.algorithm
 
         def made(key):
-            networks = a.init(shape(self.game), key)
+            networks = a.init(self.trainer.shape, key)
             return a.policy(networks), a.lyapunov(networks)
 
         like = eqx.filter_eval_shape(made, jax.random.key(0))
@@ -277,7 +325,7 @@ class Run:
 
     def sinks(self, names: Iterable[str] = ()) -> Sinks:
         """Where the log is told as well, with all that it holds: log.csv, TensorBoard, these."""
-        made = {"task": self.game, "algorithm": self.trainer.algorithm}
+        made = {"task": self.trainer.game, "algorithm": self.trainer.algorithm}
         made |= {"schedule": self.trainer.schedule}
         about = About(
             self.directory,
@@ -305,20 +353,36 @@ class Run:
         store.write_text_atomic(self.directory / "log.jsonl", text)
 
 
-def load_policy(directory: Path | str, task: AbstractGame | str | None = None) -> Decentralised:
+def load_policy(
+    directory: Path | str, task: AbstractGame | str | None = None
+) -> Decentralised | HostPolicy:
     """The policy that a run deploys, ready to act.
 
     Arguments: directory, of the run; task, the run's task where it is code of your own: the object,
     or path/to/file.py:Name, which is executed.
 
-    `load_policy(...).policy(obs, key)` takes what the agents observe [agent, obs] and gives actions
-    [agent, input] in [-1, 1]; times `game.plant.limits` they are inputs in their units. Row i
-    follows from row i alone, and what `obs` holds is told by `game.entries()`. Called with a State
-    and a key it is a controller of the run's game.
+    `load_policy(...).agent(i, obs)` is what agent i does at its own observation [obs] alone:
+    numbers in [-1, 1]; times `game.plant.limits` they are inputs in their units.
+    `load_policy(...).policy(obs, key)` takes what all agents observe [agent, obs] and gives actions
+    [agent, input]. Row i follows from row i alone, and what `obs` holds is told by
+    `game.entries()`. Called with a State and a key it is a controller of the run's game; the policy
+    of a game outside JAX is called with what all agents observe.
     Raises UserError if the directory is no run, has no policy yet, or needs `task`.
     """
-    game = config.load(task, AbstractGame) if isinstance(task, str) else task
-    return Run.open(directory, game).controller()
+    game = config.load_task(task) if isinstance(task, str) else task
+    run = Run.open(directory, game)
+    return acting(run.trainer.game, run)
+
+
+@singledispatch
+def acting(game: AbstractGame, run: Run) -> Decentralised | HostPolicy:
+    """The run's policy as what acts in this kind of game."""
+    return run.controller()
+
+
+@acting.register
+def _(game: Hosted, run: Run) -> Decentralised | HostPolicy:
+    return HostPolicy(run.deployed()[0], game)
 
 
 def _recorded(code: Any, part: str, where: str, own: Iterable[str]) -> dict[str, Any]:
@@ -342,7 +406,7 @@ def _fits(policy: Policy, game: AbstractGame) -> bool:
     return action.shape == (game.agents, game.du)
 
 
-def begin(trainer: Trainer, seed: int) -> Carry:
+def begin(trainer: AbstractTrainer, seed: int) -> Carry:
     """The state of a fresh run. Raises UserError if what it began with was not played in numbers.
 
     In numbers: all are finite, and no cost is negative.
@@ -350,17 +414,35 @@ def begin(trainer: Trainer, seed: int) -> Carry:
     key = seeds.stream(seed, "train")
     like = lambda: eqx.filter_eval_shape(trainer.begin, key)[0]
     carry, health = export_cache.compiled(_begin, with_arrays(trainer), key, like)(key)
-    if fault := Health(**health).by_task(trainer.game.agents):
+    if fault := Health(**health).by_task(trainer.agents):
         when = f"in the warm-up (seed {seed})"
         raise UserError(f"{fault.says(when)} (check-task says more).")
     return carry
 
 
-def _begin(trainer: Trainer, key: jax.Array) -> tuple[Carry, dict[str, Any]]:
+def _begin(trainer: AbstractTrainer, key: jax.Array) -> tuple[Carry, dict[str, Any]]:
     carry, health = trainer.begin(key)
     return carry, health._asdict()
 
 
+@singledispatch
+def permitted(game: AbstractGame | Hosted, given: AbstractGame | Hosted | None) -> None:
+    """Raise UserError where the game is a file that the user has not named.
+
+    What run.json says of code is never executed by itself.
+    """
+
+
+@permitted.register
+def _(game: Hosted, given: AbstractGame | Hosted | None) -> None:
+    named = given.source if isinstance(given, Hosted) else None
+    if is_file(game.source) and named != game.source:
+        raise UserError(
+            f"task: it is played by code of your own; name it with --task {game.source}."
+        )
+
+
+@singledispatch
 def sound(game: AbstractGame) -> None:
     """Raise UserError for what a task returns in a wrong shape or type, or where it raises.
 
@@ -369,6 +451,11 @@ def sound(game: AbstractGame) -> None:
     for fault in shapes(game):
         place = defined_at(game, fault.partition(":")[0]) if " it raised " not in fault else None
         raise UserError(f"task: {f'{place}: ' if place else ''}{fault}")
+
+
+@sound.register
+def _(game: Hosted) -> None:
+    """Its sizes were read when it was opened, and each number is checked when it comes."""
 
 
 def expand(paths: Iterable[Path | str]) -> list[Path]:

@@ -8,7 +8,6 @@ given each new line. log.jsonl alone is read back by marlyap.
 import csv
 import hashlib
 import io
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -81,15 +80,20 @@ class Csv:
 
 
 class TensorBoard:
-    """events.out.tfevents.*: every figure as a scalar over the environment steps."""
+    """events.out.tfevents.*: every figure as a scalar over the environment steps.
+
+    The time of a line is that in the file's name and the seconds trained until then, so that the
+    same log is the same file.
+    """
 
     def __init__(self, about: About, history: Sequence[Line]):
         self.path = tensorboard.path_in(about.directory)
+        self.began = tensorboard.began(self.path)
         tensorboard.rewrite(self.path, b"".join(map(self._record, history)))
 
-    @staticmethod
-    def _record(line: Line) -> bytes:
-        return tensorboard.record(tensorboard.event(figures(line), int(line["steps"]), time.time()))
+    def _record(self, line: Line) -> bytes:
+        when = self.began + float(line["seconds"])
+        return tensorboard.record(tensorboard.event(figures(line), int(line["steps"]), when))
 
     def line(self, line: Line) -> None:
         with open(self.path, "ab") as file:

@@ -7,6 +7,7 @@ from typing import Any
 from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
 from marlyap.learning.algorithm import AbstractAlgorithm
+from marlyap.learning.hosted import Hosted
 from marlyap.runs import config
 from marlyap.runs.run import Run
 from marlyap.shields import Shield, behind, split
@@ -65,7 +66,9 @@ def changed(game: AbstractGame, overrides: Mapping[str, str], shield: bool = Fal
     return behind(parts["task"], parts.get("shield"))
 
 
-def unfolded(game: AbstractGame, shield: bool, overrides: Mapping[str, str]) -> dict[str, Any]:
+def unfolded(
+    game: AbstractGame | Hosted, shield: bool, overrides: Mapping[str, str]
+) -> dict[str, Any]:
     """What `overrides` may set: the task, and its shield where it has one or is to have one."""
     inner, own = split(game)
     if own is None and not shield:
@@ -83,9 +86,9 @@ def refuse_all_but_task(overrides: Mapping[str, str]) -> None:
             raise UserError(f"--{path}: only a training sets it; here --task.FIELD can be set.")
 
 
-def supplies(task: str, given: AbstractGame, run: Run) -> bool:
+def supplies(task: str, given: AbstractGame | Hosted, run: Run) -> bool:
     """Whether the named task is the code of the run's own game."""
     name = task.rpartition(":")[2]
-    game = split(run.game)[0]
-    own = type(given) is type(game) and bool(config.own_classes(given))
-    return own and name in (type(game).__name__, run.labels["task"])
+    there = split(run.trainer.game)[0]
+    own = type(given) is type(there) and bool(config.code_of(given, task))
+    return own and name in (type(there).__name__, run.labels["task"])

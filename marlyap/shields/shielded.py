@@ -11,7 +11,7 @@ Every step, agent i: an action is applied if the plan from the state x' that it 
 and S + A >= 0 or the window is open; then S <- clip(S + A, 0, sigma J'). Else kappa is applied.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -197,17 +197,19 @@ class Shielded(AbstractWrapper):
         return self.inner.hold(self.inside(state))
 
 
-def behind(game: AbstractGame, shield: Shield | None) -> AbstractGame:
+def behind(game: Any, shield: Shield | None) -> Any:
     """The game behind this shield; as it is where there is none.
 
-    Raises UserError for a game whose agents have no base law.
+    Raises UserError for a game whose agents have no base law, such as one outside JAX.
     """
     if shield is None:
         return game
+    if not isinstance(game, AbstractGame):
+        raise UserError("shield: no base law is known outside JAX; leave --shield out.")
     shield.plan(plain_game(game))
     return Shielded(regulated(game), shield)
 
 
-def split(game: AbstractGame) -> tuple[AbstractGame, Shield | None]:
+def split(game: Any) -> tuple[Any, Shield | None]:
     """The game before its shield, and the shield if it has one."""
     return (game.inner, game.shield) if isinstance(game, Shielded) else (game, None)

@@ -6,8 +6,10 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from marlyap.errors import UserError
 from marlyap.games.game import AbstractGame
 from marlyap.types import Action, Key, Obs, State, Trajectory
 
@@ -51,6 +53,33 @@ class Decentralised(eqx.Module):
 
     def __call__(self, state: State, key: Key) -> Action:
         return self.policy(self.game.observations(state), key)
+
+    def agent(self, agent: int, obs: Float[Array, "obs"]) -> Float[Array, "du"]:
+        """What one agent does at its own observation alone, in [-1, 1].
+
+        Raises UserError for an agent that there is not, or a policy that sees what others observe.
+        """
+        return act_alone(self.policy, self.game.agents, agent, obs)
+
+
+def act_alone(
+    policy: Policy, agents: int, agent: int, obs: Float[Array, "obs"]
+) -> Float[Array, "du"]:
+    """The agent's row of a deployed policy's action; the other rows are made up.
+
+    Raises UserError for an agent that there is not, or where the other rows matter.
+    """
+    if not 0 <= agent < agents:
+        raise UserError(f"agent: there is no agent {agent}; take 0 to {agents - 1}.")
+    key = jax.random.key(0)  # a deployed policy draws nothing
+    among = lambda other: jnp.full((agents, *obs.shape), other, obs.dtype).at[agent].set(obs)
+    one, two = (policy(among(other), key)[agent] for other in (0.0, 1.0))
+    if not np.allclose(one, two, atol=1e-6):
+        raise UserError(
+            "policy: what this agent does depends on what others observe; give the observations of "
+            "all agents."
+        )
+    return one
 
 
 class AbstractPlanner(eqx.Module):

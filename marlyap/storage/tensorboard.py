@@ -78,9 +78,9 @@ def event(values: Mapping[str, float], step: int, wall_time: float) -> bytes:
     return head + _bytes(5, summary)
 
 
-def first() -> bytes:
-    """What every file begins with: the version of its format."""
-    return record(b"\x09" + struct.pack("<d", time.time()) + _bytes(3, VERSION))
+def began(path: Path) -> float:
+    """The time in the name of an event file (s)."""
+    return float(path.name.split(".")[3])
 
 
 def path_in(directory: Path) -> Path:
@@ -91,5 +91,6 @@ def path_in(directory: Path) -> Path:
 
 
 def rewrite(path: Path, records: bytes) -> None:
-    """The file with these records alone, whole or not at all."""
-    store.write_bytes_atomic(path, lambda file: file.write(first() + records))
+    """The file with these records alone, behind the version of its format; whole or not at all."""
+    first = record(b"\x09" + struct.pack("<d", began(path)) + _bytes(3, VERSION))
+    store.write_bytes_atomic(path, lambda file: file.write(first + records))

@@ -4,8 +4,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 from marlyap.errors import UserError
-from marlyap.learning.source import Play, Simulated
 from marlyap.learning.traced import is_traced
+from marlyap.learning.trainers import trainer_for
+from marlyap.learning.training import AbstractTrainer
 from marlyap.runs import asked as asking, config
 from marlyap.runs.asked import Asked
 from marlyap.sweeps.plan import WORDS, Cell, Plan, Range, name_of
@@ -49,11 +50,11 @@ def made_of(cell: Cell, where: str, memory: dict[str, Any] | None = None) -> tup
     program = _program(cell, parts)
     kept = lambda key, make: memory[key] if key in memory else memory.setdefault(key, make())
     common = {k: v for k, v in cell.items() if not k.startswith("algorithm.")}
-    trained = lambda: Play(Simulated(parts["game"]), parts["schedule"]).iterations
+    trained = lambda: _trainer(parts, where).iterations
     told = lambda: [config.record(parts[part]) for part in ("game", "schedule")]
     iterations = kept(f"iterations {common}", trained)
     text = f"{kept(f'record {common}', told)} {config.record(parts['algorithm'])}"
-    kept(f"fits {program}", lambda: _fits(parts, where))
+    kept(f"fits {program}", lambda: _trainer(parts, where))
     return Made(name_of(cell), cell, iterations, program), text
 
 
@@ -67,10 +68,10 @@ def _parts(cell: Mapping[str, str], where: str) -> dict[str, Any]:
         raise UserError(f"{where}: {str(error).removeprefix('--')}") from None
 
 
-def _fits(parts: Mapping[str, Any], where: str) -> None:
-    """Raise UserError, beginning with `where`, if the algorithm does not take this team."""
+def _trainer(parts: Mapping[str, Any], where: str) -> AbstractTrainer:
+    """The trainer. Raises UserError, beginning with `where`, if the algorithm does not fit."""
     try:
-        parts["algorithm"].fits(parts["game"].agents)
+        return trainer_for(parts["game"], parts["algorithm"], parts["schedule"])
     except UserError as error:
         raise UserError(f"{where}: {str(error).removeprefix('--')}") from None
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from marlyap.errors import UserError, explained
-from marlyap.learning.trainer import Trainer
+from marlyap.learning.training import AbstractTrainer
 from marlyap.runs import asked, config, events
 from marlyap.runs.launch import together
 from marlyap.runs.run import Run
@@ -76,7 +76,7 @@ def run_of(job: Job) -> Run:
     return Run(run.directory, trainer, run.seed, run.names)
 
 
-def _record(trainer: Trainer) -> list[Any]:
+def _record(trainer: AbstractTrainer) -> list[Any]:
     return [config.record(p) for p in (trainer.game, trainer.algorithm, trainer.schedule)]
 
 

@@ -105,7 +105,7 @@ class MADDPG(AbstractOffPolicy):
     def J_Q(self, Q: Critic, l: Networks, b: Transition, next_action: Action) -> Scalar:
         """(6) of Lowe et al., for every critic; the smaller target where there are two."""
         Q_next = jnp.min(l.Q_bar(b.next_features, next_action), axis=0)
-        y = self.reward_scale * self.team(b.reward) + b.discount * Q_next
+        y = self.reward_scale * self.team(b.reward) + self.team(b.discount) * Q_next
         return 0.5 * jnp.sum(jnp.mean((Q(b.features, b.action) - y[None]) ** 2, axis=1))
 
     def J_pi(self, pi: Actors, Q: Critic, b: Transition) -> Scalar:
@@ -120,6 +120,7 @@ class MADDPG(AbstractOffPolicy):
         eps = self.smoothing * b.noise[:, :, 0]
         eps = jnp.clip(eps, -self.smoothing_clip, self.smoothing_clip)
         next_action = jnp.clip(jax.vmap(l.pi_bar.mode)(b.next_obs) + eps, -1.0, 1.0)
+        next_action = jax.vmap(l.pi_bar.within)(next_action)
 
         # theta <- theta - rate grad J_Q
         J_Q = lambda Q, b, a: self.J_Q(Q, l, b, a)

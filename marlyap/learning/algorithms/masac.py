@@ -128,7 +128,7 @@ class MASAC(AbstractOffPolicy):
         alpha = jnp.exp(l.log_alpha.value)
         Q_next = jnp.min(l.Q_bar(b.next_features, nxt.action), axis=0)
         V_next = Q_next - alpha * jnp.sum(nxt.log_prob)
-        y = self.reward_scale * self.team(b.reward) + b.discount * V_next
+        y = self.reward_scale * self.team(b.reward) + self.team(b.discount) * V_next
         return 0.5 * jnp.sum(jnp.mean((Q(b.features, b.action) - y[None]) ** 2, axis=1))
 
     def J_pi(self, now: Sample, nxt: Sample, l: Networks, b: Transition) -> Scalar:

@@ -70,6 +70,11 @@ class DecentralisedSAC(AbstractWrapped):
             )
 
     def init(self, shape, key):
+        if shape.inputs:
+            raise UserError(
+                "algorithm: agents that learn alone must decide equally many numbers each; use "
+                "masac, which pads."
+            )
         one = shape._replace(agents=1, features=shape.obs)
         keys = jax.random.split(key, shape.agents)
         return eqx.filter_vmap(lambda k: self.sac.init(one, k))(keys)
@@ -95,7 +100,8 @@ def alone(b: Transition, i: Int[Array, ""]) -> Transition:
     """One transition as agent i has it: a game of one agent, whose state is what it observes."""
     own = {f.name: getattr(b, f.name) for f in dataclasses.fields(b) if f.name != "discount"}
     own |= {"features": b.obs, "next_features": b.next_obs}
-    return Transition(**{k: x[i][None] for k, x in own.items()}, discount=b.discount)
+    discount = jnp.broadcast_to(b.discount, b.reward.shape)[i]
+    return Transition(**{k: x[i][None] for k, x in own.items()}, discount=discount)
 
 
 def team(actors: Actors) -> Actors:

@@ -1,0 +1,1 @@
+"""Games that are played outside JAX, of any make: nothing here imports JAX."""
