@@ -263,12 +263,16 @@ def differences(args: Any) -> None:
 
 
 def paired(a: np.ndarray, b: np.ndarray, rng: np.random.Generator) -> str:
-    """Mean difference over seeds [seed, start] with a two-level bootstrap interval."""
+    """Mean difference over seeds [seed, start] with a two-level bootstrap interval.
+
+    Starts are drawn together, and so are training seeds where both have as many.
+    """
     drawn, n = [], a.shape[1]
     for _ in range(2_000):
         starts = rng.integers(n, size=n)
-        mean = lambda x, s=starts: x[rng.integers(len(x), size=len(x))][:, s].mean()
-        drawn.append(mean(a) - mean(b))
+        seeds = rng.integers(len(a), size=len(a))
+        others = seeds if len(a) == len(b) else rng.integers(len(b), size=len(b))
+        drawn.append(a[seeds][:, starts].mean() - b[others][:, starts].mean())
     low, high = np.quantile(drawn, [0.025, 0.975])
     return f"{a.mean() - b.mean():+.3f} [{low:+.3f}, {high:+.3f}]"
 
