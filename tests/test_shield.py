@@ -309,7 +309,7 @@ def test_a_shielded_team_is_certified_whatever_its_policy(full_compilation):
     verdict = replace(CERTIFICATES["shielded"], rollouts=20).check(
         ClosedLoop(game, at_random(game)), 0
     )
-    assert verdict.holds and verdict.evidence == "proved" and "by construction" in verdict.claim
+    assert verdict.holds and verdict.evidence == "observed" and "by construction" in verdict.claim
     assert verdict.figures["steps_of_a_leader"] <= verdict.bound
     assert verdict.figures["paid_over_bound"] <= 1 + 1e-4
     weak = game.beneath(lambda g: disturbed(g, gain=0.8))

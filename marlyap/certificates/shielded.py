@@ -58,7 +58,7 @@ class Shielded(AbstractCertificate):
 
     rollouts: int = 100
     confidence: float = 1.0
-    evidence: ClassVar[Evidence] = "proved"
+    evidence: ClassVar[Evidence] = "observed"
 
     def refuse(self, loop):
         shield = split(loop.game)[1]

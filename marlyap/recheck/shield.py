@@ -164,7 +164,7 @@ def check(case: Case, shield: dict[str, Any]) -> dict[str, Any]:
     holds = not own and bool(found["rest"].all())
     agree("whether shielded holds", holds, v["holds"])
     agree("the claim of shielded", claim(v["bound"], shield, said["broken"]), v["claim"])
-    agree("the evidence of shielded", "proved", v["evidence"])
+    agree("the evidence of shielded", "observed", v["evidence"])
     return {"trials": n, "successes": int(found["rest"].sum()), "bound": v["bound"], "border": 0}
 
 
