@@ -119,11 +119,13 @@ def env(task: Any = "rendezvous", **more: Any) -> Any:
 
 def register() -> None:
     """Make every task of `marlyap list` known as marlyap/NAME-v0 to PettingZoo's registry."""
-    from pettingzoo import register as registered
+    from pettingzoo.env_registry import registration
 
     from marlyap.tasks import TASKS
 
+    there = {"parallel": registration.parallel_registry, "aec": registration.aec_registry}
     for name in TASKS:
         for kind, maker in (("parallel", parallel_env), ("aec", env)):
-            made = functools.partial(maker, name)
-            registered(kind, f"marlyap/{name}-v0", made)  # pyright: ignore
+            spec, made = f"marlyap/{name}-v0", functools.partial(maker, name)
+            if spec not in there[kind]:
+                registration.register(kind, spec, made)  # pyright: ignore

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from long import LONG
 
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -44,6 +45,20 @@ def keep_compiled_code():
 
 
 keep_compiled_code()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Mark what is long as slow; an entry that names no test of a file that was read is a fault."""
+    read = {Path(item.path).name for item in items}
+    wanted = {(file, name) for file, names in LONG.items() for name in names}
+    for item in items:
+        own = Path(item.path).name, item.name
+        if own in wanted:
+            item.add_marker(pytest.mark.slow)
+            wanted.discard(own)
+    if read >= {*LONG}:
+        assert not wanted, f"tests/long.py names what is not there: {sorted(wanted)}"
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -164,7 +164,9 @@ def test_a_role_that_is_not_there(contract, arrays):
 
 
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
-@pytest.mark.parametrize("kind", list(DYNAMICS))
+@pytest.mark.parametrize(
+    "kind", [kind for kind, d in DYNAMICS.items() if type(d).__name__ in MOTIONS]
+)
 def test_the_plant_is_the_games(kind, integrator):
     from dataclasses import replace
 
@@ -178,7 +180,8 @@ def test_the_plant_is_the_games(kind, integrator):
     if integrator == "rk4" and kind != "late-unicycle":  # many small pieces end there too
         fine = coasted(plant, x.astype(float), u, 1e-4, 1000)
         np.testing.assert_allclose(fine, wanted, atol=2e-3)
-    assert {type(each).__name__ for each in DYNAMICS.values()} == {*MOTIONS}
+    known = {type(each).__name__ for each in DYNAMICS.values()}
+    assert known - {*MOTIONS} == {"UnstablePoint"}  # exported with its observation as the input
 
 
 # --- What was altered is refused -----------------------------------------------------------------

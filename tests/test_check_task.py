@@ -410,6 +410,13 @@ class TupleWithoutAType(Sound):
     leaders = (0, 1)
 
 
+@breaks("channels", "observation_entries: they name 19 numbers, and an observation has 20")
+class OneMoreThanItSays(Sound):
+    def observe(self, state, links):
+        seen = super().observe(state, links)
+        return jnp.concatenate([seen, seen[:, :1]], axis=1)
+
+
 CHANCE = {"compiled", "batched", "bounded_inputs", "target", "smooth_step"}
 ALSO = {  # other laws that the same mistake may break
     CostIsInfinite: {"costs", "rewards", "smooth_cost"},
@@ -418,7 +425,7 @@ ALSO = {  # other laws that the same mistake may break
     StartHasItsOwnChance: {"resets"},
     ViewOfTheWholeBatch: {"compiled", "local", "links"},
     NoCost: {"rewards"},
-    EverybodySeesEverybody: {"links"},
+    EverybodySeesEverybody: {"channels", "links"},
     FollowersSeeTheirGoal: {"links"},
     GoalMoves: {"target"},
     OverAtOnce: {"termination"},

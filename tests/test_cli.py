@@ -240,7 +240,7 @@ def test_a_demo_of_no_steps_is_refused(capsys, monkeypatch):
     refused(capsys, "demo", "--steps", "0", parts=["steps: 0 is out of range"])
 
 
-@pytest.mark.parametrize("what", ["--task.agents", "--schedule.steps", "--steps", "--preset"])
+@pytest.mark.parametrize("what", ["--task.agents", "--schedule.steps", "--preset"])
 def test_resume_refuses_what_it_would_ignore(what, unfinished, capsys, monkeypatch):
     from marlyap.cli import training
 

@@ -30,6 +30,7 @@ FIELDS = {
     "late-unicycle": lambda x, u: np.array([*unicycle(x[:5], x[5:]), 0, 0]),
     "double-integrator": lambda x, u: np.array([x[2], x[3], u[0], u[1]]),
     "single-integrator": lambda x, u: np.array(u),
+    "unstable-point": lambda x, u: np.array([x[2], x[3], x[2] + u[0], x[3] + u[1]]),
 }
 every = pytest.mark.parametrize("name", FIELDS)
 

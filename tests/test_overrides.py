@@ -170,8 +170,8 @@ def oracle():
 
 def test_the_game_replaces_every_method():
     methods = {n for n, f in vars(AbstractPlanar).items() if callable(f) and not n.startswith("_")}
-    final = {"local_view", "strengthened", "resized", "farther", "aside"}
-    final |= {"local_entries", "state_shapes"}  # words about them
+    final = {"local_view", "strengthened", "resized", "farther", "aside", "pushed", "retargeted"}
+    final |= {"local_entries", "local_sight", "state_shapes"}  # words about them
     assert methods - final <= set(vars(Own))
 
 

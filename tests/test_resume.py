@@ -595,16 +595,21 @@ def test_a_worker_does_its_job_and_obeys(tmp_path):
 def test_runs_side_by_side_go_by_their_settings_and_faults_are_told_at_the_end(monkeypatch):
     """On a GPU: one program for runs that differ in their seed alone, the next one after it."""
 
+    class Named(str):
+        side_by_side = True
+
     class Known(Run):
         finished = property(lambda self: self.done)
 
-        def __init__(self, trainer, seed, done=True):
+        def __init__(self, name, seed, done=True):
+            trainer = Named(name)
             vars(self).update(
                 trainer=trainer, seed=seed, done=done, directory=Path(f"{trainer}{seed}")
             )
 
     run = Known
     groups = []
+    monkeypatch.setattr(launching, "program", lambda trainer: trainer)
 
     def fit(group, stop, attempts, log):
         groups.append([(r.trainer, r.seed) for r in group])
@@ -776,9 +781,10 @@ def test_what_is_stopped_says_how_to_go_on(number, tmp_path, capsys, monkeypatch
     line, before = Run.log, signal.getsignal(number)
 
     def interrupted(self, entry):
-        line(self, entry)
+        whole = line(self, entry)
         if entry["iteration"] == 2:
             os.kill(os.getpid(), number)
+        return whole
 
     monkeypatch.setattr(Run, "log", interrupted)
     assert main(["train", "--resume", str(run.directory), "--json"]) == 128 + number

@@ -185,7 +185,7 @@ CASES = [
     ("train --resume missing", "run"),
     ("train --resume kept", "run"),
     ("train --resume RUN --seeds 3", "--seeds"),
-    ("train --resume RUN --steps 10", "--steps"),
+    ("train --resume RUN --steps 10", "steps: "),
     ("train --resume RUN --out new", "--out"),
     ("train --resume RUN --task.agents 4", "--task.agents"),
     ("train --resume RUN RUN", "run"),

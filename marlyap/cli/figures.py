@@ -171,10 +171,11 @@ class Column(NamedTuple):
 
 def later(row: dict[str, Any]) -> str:
     """What became of it until the end of the watch, in words."""
-    at_end = row["end_speed"]["0.95"]
     said = f"{share(row['lost'])} % lost (farther off at the end than at the start)"
     said += f", 95 % of the worst distances swing by at most {number(row['swing']['0.95'])}"
-    said += f" in the last horizon, and the fastest end at {number(at_end)} m/s"
+    said += " in the last horizon"
+    if "final_speed" in row:  # the game has a map
+        said += f", and the fastest end at {number(row['end_speed']['0.95'])} m/s"
     back = row["back"]
     return said if back is None else f"{said}; {100 * back:.1f} % of horizons end in success"
 

@@ -17,7 +17,7 @@ from marlyap.types import Action, State
 
 
 class Perturbed(AbstractWrapper):
-    """`inner` with stronger or weaker inputs, noise, delay, lost messages, agents or edges.
+    """Another game with stronger or weaker inputs, noise, delays, lost messages, agents or edges.
 
     A controller made for `inner` drives it unchanged. Every method of `inner` is asked, with the
     state as `inner` knows it, so that whatever a task replaces is what is perturbed; perturbations
