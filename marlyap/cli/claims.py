@@ -54,14 +54,13 @@ def about(
 
 
 def usual(game: AbstractGame) -> tuple[str, ...]:
-    """The certificates to ask for where none is named."""
-    some = {"safe": has_rules(game), "shielded": split(game)[1] is not None}
-    return (
-        *SAMPLED,
-        "linearisation",
-        "ellipsoid",
-        *(name for name, is_so in some.items() if is_so),
-    )
+    """The certificates to ask for where none is named.
+
+    Robots in the plane mostly roll or turn, and then have no ellipsoid: it is asked for by name.
+    """
+    some = {"ellipsoid": game.sight() is None, "safe": has_rules(game)}
+    some |= {"shielded": split(game)[1] is not None}
+    return (*SAMPLED, "linearisation", *(name for name, is_so in some.items() if is_so))
 
 
 def chosen(names: Iterable[str], rollouts: int | None) -> dict[str, AbstractCertificate]:
