@@ -51,7 +51,9 @@ class Perturbed(AbstractWrapper):
         if not 0 <= self.noise < 100 or not 0 <= self.drop <= 1 or not 0 <= self.delay <= 1000:
             raise UserError("perturbation: noise, delay and drop must not be negative, drop <= 1.")
         if not 0 <= self.push < 1e6 or not 0 <= self.jump < 1e6 or self.every < 1:
-            raise UserError("perturbation: push and jump must not be negative, every at least 1.")
+            raise UserError(
+                "perturbation: push and jump must lie between 0 and 1e6, every be at least 1."
+            )
         self._robots()
         missing = {*self.gone, *(i for edge in self.cut for i in edge)}
         if not missing <= set(range(self.inner.agents)):
